@@ -29,6 +29,7 @@ STATED = {  # a lawful value of each fact
     "regions": ((0, 0, 3, 3), (4, 4, 3, 3)),
     "white": True,
     "times_s": (0.0, 60.0),
+    "temperatures_c": (20.0, 25.0),
     "interval_s": 60.0,
     "on_for_s": 30.0,
     "recorded": True,
@@ -37,6 +38,7 @@ STATED = {  # a lawful value of each fact
 WITH = {
     "regions": {"densities": (0.1, 0.5)},
     "on_for_s": {"interval_s": 60.0},
+    "temperatures_c": {"interval_s": 60.0},
     "pulsed": {"interval_s": 60.0},
 }  # facts that another one needs
 

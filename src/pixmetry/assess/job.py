@@ -334,11 +334,14 @@ def _with_series(
     others = f"of {len(groups)} series the one of the most frames is used" if len(groups) > 1 else ""
     on_for_s = group.facts.on_for_s or 0.0
     frames = [(path.name, on_for_s + time, partial(reader.fetch, path)) for path, time in zip(group.paths, _times(group), strict=True)]
+    order = sorted(range(len(frames)), key=lambda k: frames[k][1])
+    told = group.facts.temperatures_c
     try:
         found = measure_series(
-            sorted(frames, key=lambda frame: frame[1]),
+            [frames[k] for k in order],
             analogue=campaign.camera.interface == "analogue",
             pixel_clock_mhz=campaign.camera.pixel_clock_mhz,
+            temperatures_c=None if told is None else [told[k] for k in order],
             progress=lambda what, done, of: (on_frames(1), None)[1],
             bits=campaign.bits,
         )

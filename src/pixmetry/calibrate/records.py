@@ -694,6 +694,8 @@ class Pattern:
     gain : float
         What it explains beside the patterns that were chosen before, as a difference of Schwarz's criterion (see
         `pixmetry.calibrate.checks.causes`); above 10 its cause is named alone if no other explains the same as well.
+    confirmed : bool
+        Whether its cause was measured, with all that residuals have in common in its uncertainty.
     behind : str
         The pattern beside which it explains nothing more; empty: none.
     """
@@ -714,6 +716,7 @@ class Pattern:
     causes: tuple[str, ...] = ()
     gain: float = 0.0
     behind: str = ""
+    confirmed: bool = False
 
     @property
     def alone(self) -> str | None:
@@ -858,6 +861,12 @@ class FieldSources:
     height: HeightMap | None = None
     seams: Seams | None = None
     scales: ImageScales | None = None
+
+    @property
+    def confirmed(self) -> tuple[str, ...]:
+        """Names of the patterns whose cause was found."""
+        found = {"unflatness": self.height is not None and self.height.found, "seams": self.seams is not None and self.seams.found}
+        return tuple(name for name, yes in found.items() if yes)
 
 
 @dataclass(frozen=True)

@@ -46,6 +46,8 @@ class DriftSeries:
         Variance of the targets' blur about its mean over the series; NaN where it is not measured.
     focus : Number
         Change of that variance from the first fifth of the series to the last one, px².
+    thermal : Estimates or None
+        Of a series with the temperature of every frame, see `pixmetry.series.thermal`; the motion is then what is left without it.
     """
 
     time_s: np.ndarray
@@ -63,3 +65,4 @@ class DriftSeries:
     blur_px2: np.ndarray
     u_blur_px2: np.ndarray
     focus: Number
+    thermal: Estimates | None = None

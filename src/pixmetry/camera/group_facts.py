@@ -27,6 +27,8 @@ class GroupFacts:
         True: the frames show a white sheet in place of the chart, in the same light.
     times_s : tuple of float, or None
         When each frame of a series or sequence was taken.
+    temperatures_c : tuple of float, or None
+        Of the sensor, in each frame of a series.
     interval_s : float or None
         Time from frame to frame of a series or sequence.
     on_for_s : float or None
@@ -45,6 +47,7 @@ class GroupFacts:
     regions: tuple[tuple[int, int, int, int], ...] | None = None
     white: bool | None = None
     times_s: tuple[float, ...] | None = None
+    temperatures_c: tuple[float, ...] | None = None
     interval_s: float | None = None
     on_for_s: float | None = None
     recorded: bool | None = None

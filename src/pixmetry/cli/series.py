@@ -49,9 +49,7 @@ WAIT_S = 2.0  # between looks into a folder that fills
     metavar="PX",
     help="Displacement within which the image counts as stable.",
 )
-@click.option(
-    "--kind", type=click.Choice(KINDS), help="Kind of target; texture: places of the first frame. Default: disc, else texture."
-)
+@click.option("--kind", type=click.Choice(KINDS), help="Kind of target; texture: places of the first frame. Default: disc, else texture.")
 @click.option(
     "--polarity", type=click.Choice(["auto", "bright", "dark"]), default="auto", show_default=True, help="Of the targets on their ground."
 )

@@ -43,7 +43,7 @@ FACTS = {  # what else may be said of a group, by its kind
     "dark_temperature": ("temperature_c",),
     "chart": ("densities", "luminances", "u_light_rel", "regions", "white"),
     "line": ("recorded",),
-    "series": ("times_s", "interval_s", "on_for_s"),
+    "series": ("times_s", "interval_s", "on_for_s", "temperatures_c"),
     "motion": ("times_s", "interval_s", "pulsed"),
     "speckle": ("wavelength_nm",),
     "sequence": ("times_s", "interval_s"),
@@ -287,10 +287,16 @@ def _refuse_repeated_files(groups: tuple[FrameGroup, ...], where: str) -> None:
 
 def _refuse_other_times(groups: tuple[FrameGroup, ...], where: str) -> None:
     for group in groups:
-        times = group.facts.times_s
-        if times is not None and len(times) != len(group.paths):
-            what = f"{len(times)} times for {len(group.paths)} frames"
-            raise InputError(what, where=f"{where}, {group.label}", allowed="times_s with one time for each frame", remedy="correct it")
+        for name, what in (("times_s", "times"), ("temperatures_c", "temperatures")):
+            told = getattr(group.facts, name)
+            if told is not None and len(told) != len(group.paths):
+                one = what.removesuffix("s")
+                raise InputError(
+                    f"{len(told)} {what} for {len(group.paths)} frames",
+                    where=f"{where}, {group.label}",
+                    allowed=f"{name} with one {one} for each frame",
+                    remedy="correct it",
+                )
 
 
 def _of_different_conditions(groups: list[FrameGroup], where: str) -> tuple[tuple[FrameGroup, ...], list[str]]:

@@ -131,6 +131,7 @@ class GroupModel(Model):
     regions: Annotated[tuple[tuple[FromZero, FromZero, Side, Side], ...], Field(min_length=1)] | None = None
     white: bool | None = None
     times_s: Annotated[tuple[float, ...], Field(min_length=1)] | None = None
+    temperatures_c: Annotated[tuple[Annotated[float, Field(ge=-273.15)], ...], Field(min_length=1)] | None = None
     interval_s: Positive | None = None
     on_for_s: Annotated[float, Field(ge=0)] | None = None
     recorded: bool | None = None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ from pixmetry.series.modes import LEAST_TARGETS, field_motion
 from pixmetry.series.motion import Run, find_in_fields, motion_of
 from pixmetry.series.records import Series
 from pixmetry.series.texture import texture_of
+from pixmetry.series.thermal import thermal_of
 from pixmetry.series.track import FrameTargets, blur_of, find_targets, follow_targets, near_pairs
 from pixmetry.series.warm_up import drift_of
 
@@ -205,6 +207,7 @@ def measure_series(
     analogue: bool = False,
     pixel_clock_mhz: float | None = None,
     tolerance_px: float = 0.05,
+    temperatures_c: Sequence[float] | None = None,
     log: SeriesLog | None = None,
     notes: tuple[str, ...] = (),
     progress: Progress | None = None,
@@ -212,7 +215,8 @@ def measure_series(
 ) -> Series:
     """Measure a series whose frames are fetched one by one: names, seconds since switching on, and functions that return the frames.
 
-    In memory are the frames in work, one a thread. Frames that a log holds are not fetched again.
+    In memory are the frames in work, one a thread. Frames that a log holds are not fetched again. ``temperatures_c`` are those of the
+    sensor, one for each frame.
 
     Raises
     ------
@@ -256,7 +260,11 @@ def measure_series(
         positions, covariance = follow_targets(ordered)
         blur = blur_of(ordered, positions)
         motion = field_motion(positions, covariance, (0.5 * (shape[1] - 1), 0.5 * (shape[0] - 1)), analogue=analogue)
+        thermal = None
+        if temperatures_c is not None:
+            thermal, motion = thermal_of(motion, seconds, np.asarray(temperatures_c, float))
         drift = drift_of(motion, seconds, shape, clock_mhz=pixel_clock_mhz, tolerance_px=tolerance_px, blur_px2=blur)
+    drift = replace(drift, thermal=thermal)
     lost = int((~motion.used).sum())
     what = "places" if textured else "targets"
     more = [f"{lost} of {len(named)} frames show too few of the {what} and are left out."] if lost else []

@@ -130,15 +130,20 @@ def _side_by_side(blocks: Sequence[Any]) -> Any:
     return np.hstack(blocks)
 
 
-# what makes a pattern on analogue cameras alone, and what may look so on a digital one: a source (or none), and words
+READ_OUT = ("sensor.rolling_shutter", "rows that are read one after the other while something moves")
+SCALED = ("", "targets whose distance beats with the pixels, or pictures that software has scaled")
+# what makes a pattern on analogue cameras alone, and what may look so on a digital one: sources (or none), and words
 ON_DIGITAL = {
-    "rows_x": ("sensor.rolling_shutter", "rows that are read one after the other while something moves"),
-    "columns_x": ("", "pictures that software has scaled or warped"),
-    "wave_xx": ("", "targets whose distance beats with the pixels, or pictures that software has scaled"),
-    "wave_xy": ("", "targets whose distance beats with the pixels, or pictures that software has scaled"),
-    "x_scale_trend": ("sensor.rolling_shutter", "rows that are read one after the other while something moves"),
-    "x_scale_by_image": ("sensor.rolling_shutter", "rows that are read one after the other while something moves"),
-    "x_shift_by_image": ("sensor.mount_drift", "a sensor or lens that moves between the images"),
+    "rows_x": (READ_OUT,),
+    "columns_x": (("", "pictures that software has scaled or warped"),),
+    "wave_xx": (SCALED,),
+    "wave_xy": (SCALED,),
+    "x_scale_trend": (READ_OUT, ("", "pictures that software has scaled")),
+    "x_scale_by_image": (READ_OUT, ("", "pictures that software has scaled")),
+    "x_shift_by_image": (
+        ("sensor.mount_drift", "a sensor or lens that moves between the images"),
+        ("", "a test field that is not as it is said to be"),
+    ),
 }
 SOURCES = {  # in words
     "optics.distortion": "lens distortion beyond the terms that were estimated",
@@ -182,16 +187,16 @@ def causes_of(pattern: str, source: str, interface: str | None) -> tuple[Cause, 
     Examples
     --------
     >>> [cause.source for cause in causes_of("x_scale_trend", "grabber.clock_warm_up", "digital")]
-    ['sensor.rolling_shutter']
+    ['sensor.rolling_shutter', '']
     >>> [cause.source for cause in causes_of("x_scale_trend", "grabber.clock_warm_up", None)]
-    ['grabber.clock_warm_up', 'sensor.rolling_shutter']
+    ['grabber.clock_warm_up', 'sensor.rolling_shutter', '']
     """
     if not source:
         return ()
     if not source.startswith("grabber."):
         return (Cause(source, SOURCES[source]),)
-    other = Cause(*ON_DIGITAL[pattern])
+    others = tuple(Cause(*one) for one in ON_DIGITAL[pattern])
     if interface == DIGITAL:
-        return (other,)
+        return others
     own = Cause(source, SOURCES[source])
-    return (own,) if interface == ANALOGUE else (Cause(source, f"on an analogue camera {own.words}"), other)
+    return (own,) if interface == ANALOGUE else (Cause(source, f"on an analogue camera {own.words}"), *others)

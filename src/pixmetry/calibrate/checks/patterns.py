@@ -10,7 +10,7 @@ import numpy as np
 
 from pixmetry.calibrate.bundle.network import Adjustment
 from pixmetry.calibrate.checks.added_terms import AddedTerms, Terms, whitening
-from pixmetry.calibrate.checks.causes import STRONG, Candidate, Place, causes_of, places_of
+from pixmetry.calibrate.checks.causes import Candidate, Place, causes_of, places_of
 from pixmetry.calibrate.checks.field_sources import LAYOUTS, PLAIN, field_sources, field_terms, height_terms
 from pixmetry.calibrate.checks.quality import p_words, redundancy_of
 from pixmetry.calibrate.records import ByImage, FieldSources, Outstanding, Pattern
@@ -177,10 +177,10 @@ def searched_residuals(adjustment: Adjustment, level: float = 0.01) -> Searched:
         judged = [replace(t.pattern, level=level / count, significant=bool(t.pattern.p < level / count)) for t in found]
         shown = [t.candidate for t, p in zip(found, judged, strict=True) if p.significant and t.candidate is not None]
         places = places_of(terms, shown)
-        patterns += [_worded(p, places, camera.interface) for p in judged]
         by_name = {candidate.name: candidate for candidate in shown}
         chosen = {name: (by_name[name], place) for name, place in places.items() if not place.behind}
-        sources[camera.name] = field_sources(terms, one.camera, one.mine, one.x, one.y, one.image, chosen)
+        told = sources[camera.name] = field_sources(terms, one.camera, one.mine, one.x, one.y, one.image, chosen)
+        patterns += [replace(_worded(p, places, camera.interface), confirmed=p.name in told.confirmed) for p in judged]
     return Searched(tuple(patterns), sources)
 
 
@@ -263,7 +263,7 @@ def cause_words(one: Pattern) -> str:
         return ""
     if len(one.causes) > 1:
         return f"one of: {'; '.join(one.causes)}"
-    return f"{'likely' if one.gain > STRONG else 'possible'} cause: {one.causes[0]}"
+    return f"{'likely' if one.confirmed else 'possible'} cause: {one.causes[0]}"
 
 
 def _bad_images(bad: Outstanding, where: str) -> Finding:

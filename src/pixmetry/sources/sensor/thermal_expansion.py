@@ -10,8 +10,10 @@ import numpy as np
 from pixmetry.camera.contribution import Contribution, Probe
 from pixmetry.camera.geometry import frame_centre, image_shift, map_contribution
 from pixmetry.camera.light import Pull
+from pixmetry.camera.observations import Observations, of_pictures
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 
 
@@ -41,6 +43,19 @@ def pull_of(params: ThermalExpansion, temperature_c: Any, frame_shape: tuple[int
 
 def _pull(params: ThermalExpansion, signal: Signal) -> Pull:
     return pull_of(params, signal.temperature_c[:, None, None], signal.frame_shape)
+
+
+def measure(observations: Observations) -> Estimates:
+    """From a series with the temperature of every frame: mount less sensor, which move the image alike, and shifts of the whole image."""
+    names = {name: name for name in ("shift_x_px_per_k", "shift_y_px_per_k", "reference_c")}
+    return of_pictures(
+        None if observations.drift is None else observations.drift.thermal,
+        {"mount_per_k": "scale_per_k", **names},
+        where="sensor.thermal_expansion",
+        pictures="a series of a fixed field with the temperature of every frame (temperatures_c)",
+        kind="series",
+        failed=observations.failed.get("series", ""),
+    )
 
 
 def forward(params: ThermalExpansion, signal: Signal, stream: Stream) -> Signal:
@@ -83,9 +98,8 @@ SOURCE = Source(
         "K. G. Lyon et al., Linear thermal expansion measurements on silicon, J. Appl. Phys. 48 (1977) 865",
     ),
     advice="Let the camera warm up, keep its temperature constant, and calibrate at the temperature of the measurement.",
+    measure=measure,
     reasons={
-        "measure": "a series of a fixed field shows it together with the drift of the mount, and it is counted there; both move the image "
-        "alike, and only the temperature of every frame would tell them apart",
         "correct": "frames are not resampled; positions are corrected instead, from the temperature",
     },
 )
