@@ -248,10 +248,14 @@ def pattern_findings(patterns: Sequence[Pattern]) -> tuple[Finding, ...]:
             out.append(_bad_images(one.outstanding, where))
             continue
         kind = "x_scale_drift" if one.name in DRIFT and not one.alone else one.name
-        if one.behind and kind != "x_scale_drift":
+        if one.behind and not (kind == "x_scale_drift" and one.behind in DRIFT):
             continue
         caused = f" ({words})" if (words := cause_words(one)) else ""
-        more = [MEANING[p.name][0] for p in significant if p.behind == one.name and p.camera == one.camera and p.name not in DRIFT]
+        more = [
+            MEANING[p.name][0]
+            for p in significant
+            if p.behind == one.name and p.camera == one.camera and not {p.name, one.name} <= {*DRIFT}
+        ]
         also = f". It also explains that {'; that '.join(more)}" if more else ""
         out.append(Finding(kind, f"{where}{one.text}{caused}{also}", one.advice[0].upper() + one.advice[1:] + ".", "warning"))
     return tuple(out)
