@@ -155,3 +155,12 @@ def test_a_focus_that_drifts_is_found(rng: np.random.Generator) -> None:
     assert abs(found.value - truth) < stats.norm.isf(RATE / 2) * found.u < 0.03
     still = drift_of(field_motion(positions, covariance, tuple(CENTRE)), time_s, SHAPE).focus
     assert not still.is_available
+
+
+def test_one_time_constant_is_told_as_one(rng: np.random.Generator) -> None:
+    found = drift(Warming(0.5, -0.3, fast_share=0.0, slow_s=700.0), rng)
+    if "slow_s" not in found.fit:
+        assert "one time constant of" in found.fit.reasons["slow_s"]
+    near = found.from_settled_px > 0.02
+    assert (found.u_from_settled_px[near] < 0.03).all()  # the curve is told, whichever of its parts it is
+    assert found.stable.u < 0.25 * found.stable.value

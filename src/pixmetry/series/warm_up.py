@@ -32,7 +32,10 @@ CONFOUNDERS = (
 TOO_SHORT = "the series of {:.0f} s is too short for the slow part: go on until nothing moves"
 METHOD = "positions of a fixed field of targets over time; exponential curves by generalised least squares"
 DRAWS = 2000  # of time constants: u to some per cent where curves of very different ones fit alike
+KEPT = 200  # of them, by their probability
 WIDER = 1.5  # than a minimum's own u: the draws about it
+NO_SHARE = 1e-6
+SINGLE = 13.3  # χ² that a second time constant must take away, so that it is not chance: once in 770, two parameters
 ROUNDS = 3  # of weights and curve in turn
 FAST = ("ln fast", "share")
 LOCK_US, U_LOCK_US = 10.5, 1.0  # from the sync edge to the first pixel: CCIR 10.5, EIA 9.4 to 10.9 by the width of the blanking
@@ -73,7 +76,7 @@ class Series:
 
 @dataclass(frozen=True)
 class Fit:
-    """A fitted curve: parameters, their covariance, weighted residuals."""
+    """A fitted curve: parameters, covariance, χ²; ``draws`` are curves that fit too, by their probability, shape (draws, parameters)."""
 
     curve: Curve
     names: list[str]
@@ -81,6 +84,7 @@ class Fit:
     covariance: Array
     chi2: float
     dof: int
+    draws: Array | None = None
 
     def __getitem__(self, name: str) -> float:
         return float(self.values[self.names.index(name)])
@@ -158,9 +162,11 @@ def drift_of(
     scatter, u_scatter = _scatter(single, fit)
     fit, others = _alternatives(series, fit, scatter)
     found = _parts(series, fit, scatter)
+    one_tau = _single_s(series, fit, scatter) if found.camera and not found.grabber else None
     widened = _widening(series, fit, scatter)
-    fit = replace(fit, covariance=fit.covariance * widened)
-    estimates = _estimates(series, fit, found, others, u_scatter)
+    draws = None if fit.draws is None else fit.values + np.sqrt(widened) * (fit.draws - fit.values)
+    fit = replace(fit, covariance=fit.covariance * widened, draws=draws)
+    estimates = _estimates(series, fit, found, others, u_scatter, one_tau)
     blur, u_blur = focus_motion(np.full((len(time_s), 1, 2), np.nan) if blur_px2 is None else blur_px2)
     corners = _corners(frame_shape)
     distance, u_distance = _from_settled(fit, series, corners, np.asarray(time_s, float))
@@ -283,11 +289,14 @@ def _whitening(series: Series, scatter: Array) -> Array:
     return np.linalg.inv(np.linalg.cholesky(whole))
 
 
-def _fitted(series: Series, curve: Curve, scatter: Array, starts: Sequence[Array]) -> Fit:
-    """The best fit from several starts."""
+def _fitted(series: Series, curve: Curve, scatter: Array, starts: Sequence[Array], *, single: bool = False) -> Fit:
+    """The best fit from several starts; ``single`` has no fast part."""
     names = curve.names(series.modes)
     white = _whitening(series, scatter)
     at, centre, u = _priors(names, series)
+    if single:
+        one = at.index(names.index("share"))
+        centre[one], u[one] = 0.0, NO_SHARE
     prior = np.zeros((len(at), len(names)))
     prior[np.arange(len(at)), at] = 1 / u
 
@@ -390,7 +399,11 @@ def _marginal(series: Series, fits: Sequence[Fit], scatter: Array) -> Fit:
     away = values - best.values
     covariance = np.einsum("n,np,nq->pq", weight, away, away)
     covariance[np.ix_(linear, linear)] += np.einsum("n,npq->pq", weight, inside)
-    return replace(best, covariance=covariance)
+    chosen = np.searchsorted(np.cumsum(weight), (np.arange(KEPT) + 0.5) / KEPT).clip(max=len(weight) - 1)
+    kept = values[chosen]
+    steps = stats.norm.ppf(stats.qmc.Halton(len(linear), scramble=False).random(KEPT + 1)[1:])
+    kept[:, linear] += np.einsum("npq,nq->np", np.linalg.cholesky(inside[chosen]), steps)
+    return replace(best, covariance=covariance, draws=kept)
 
 
 def _parts(series: Series, fit: Fit, scatter: Array) -> Curve:
@@ -406,6 +419,21 @@ def _parts(series: Series, fit: Fit, scatter: Array) -> Curve:
         without = _fitted(series, less, scatter, [near, *_starts(series, less, scatter)])
         found[part] = without.chi2 - fit.chi2 > stats.chi2.isf(FALSE_ALARM, len(fit.names) - len(names))
     return Curve(**found)
+
+
+def _single_s(series: Series, fit: Fit, scatter: Array) -> tuple[float, float] | None:
+    """The time constant and its u, where one fits as well as two."""
+    start = fit.values.copy()
+    start[fit.names.index("share")] = 0.0
+    starts = []
+    for slow in np.ptp(series.time_s) / np.array([1.0, 3.0, 10.0]):
+        start[fit.names.index("ln slow")] = np.log(slow)
+        starts.append(_with_linear(series, fit.curve, start, scatter))
+    one = _fitted(series, fit.curve, scatter, starts, single=True)
+    if one.chi2 - fit.chi2 > SINGLE:
+        return None
+    tau = float(np.exp(one["ln slow"]))
+    return tau, tau * one.u("ln slow")
 
 
 def _first_scatter(series: Series) -> Array:
@@ -454,7 +482,9 @@ PARAMETERS = (  # of the sources: name, parameter of the fit, unit
 OF_CAMERA = PARAMETERS[:7]
 
 
-def _estimates(series: Series, fit: Fit, found: Curve, others: Sequence[Fit], u_scatter: Array) -> Estimates:
+def _estimates(
+    series: Series, fit: Fit, found: Curve, others: Sequence[Fit], u_scatter: Array, single: tuple[float, float] | None
+) -> Estimates:
     """The parameters of the sources with their covariance: values, limits, or reasons."""
     at, _, u_prior = _priors(fit.names, series)
     wide = {fit.names[k]: u for k, u in zip(at, u_prior, strict=True)}
@@ -486,7 +516,8 @@ def _estimates(series: Series, fit: Fit, found: Curve, others: Sequence[Fit], u_
             reasons[name] = TOO_SHORT.format(span)
             continue
         elif u > TOLD_SHARE * wide.get(parameter, np.inf):
-            reasons[name] = "the series tells it no better than what is known of all cameras"
+            known = "the series tells it no better than what is known of all cameras"
+            reasons[name] = known if single is None else f"one time constant of {single[0]:.3g} ± {single[1]:.2g} s fits as well as two"
             continue
         elif name == "delay_tau_s" and abs(fit["delay"]) < SIGNIFICANT * fit.u("delay"):
             reasons[name] = "the delay is not larger than its uncertainty"
@@ -592,6 +623,12 @@ def _from_settled(fit: Fit, series: Series, corners: Array, time_s: Array) -> tu
     far = np.linalg.norm(base, axis=2).argmax(axis=1)
     rows = np.arange(len(time_s))
     chosen = base[rows, far]
+    size = np.linalg.norm(chosen, axis=1)
+    along = np.divide(chosen, size[:, None], out=np.full_like(chosen, np.sqrt(0.5)), where=size[:, None] > 0)
+    if fit.draws is not None:
+        moved = np.einsum("kam,nkm->nka", design_of(corners, series.modes)[far], _to_settle(fit, fit.draws, time_s))
+        away = np.einsum("nka,ka->nk", moved - chosen, along)
+        return size, np.sqrt((away**2).mean(axis=0))
     slopes = np.zeros((len(time_s), 2, len(fit.names)))
     for k in range(len(fit.names)):
         step = np.zeros(len(fit.names))
@@ -599,9 +636,17 @@ def _from_settled(fit: Fit, series: Series, corners: Array, time_s: Array) -> tu
         more, less = (_left(fit, series, fit.values + sign * step, corners, time_s)[rows, far] for sign in (1, -1))
         slopes[:, :, k] = (more - less) / (2 * step[k])
     covariance = np.einsum("kap,pq,kbq->kab", slopes, fit.covariance, slopes)
-    size = np.linalg.norm(chosen, axis=1)
-    along = np.divide(chosen, size[:, None], out=np.full_like(chosen, np.sqrt(0.5)), where=size[:, None] > 0)
     return size, np.sqrt(np.maximum(np.einsum("ka,kab,kb->k", along, covariance, along), 0.0))
+
+
+def _to_settle(fit: Fit, draws: Array, time_s: Array) -> Array:
+    """Modes of a camera less where they settle, of many curves, shape (draws, times, modes)."""
+    at = {name: k for k, name in enumerate(fit.names)}
+    slow, share = np.exp(draws[:, at["ln slow"]]), draws[:, at["share"]]
+    fast = slow * np.exp(draws[:, at["ln fast"]])
+    left = share[:, None] * np.exp(-time_s / fast[:, None]) + (1 - share)[:, None] * np.exp(-time_s / slow[:, None])
+    moved: Array = -left[:, :, None] * draws[:, None, [at[mode] for mode in CAMERA_MODES]]
+    return moved
 
 
 def _stability(fit: Fit, series: Series, found: Curve, corners: Array, tolerance_px: float, *, settles: bool) -> Number:
