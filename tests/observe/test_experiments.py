@@ -33,9 +33,13 @@ STATED = {  # a lawful value of each fact
     "interval_s": 60.0,
     "on_for_s": 30.0,
     "recorded": True,
+    "band": "LED red",
+    "filtered": True,
+    "refocused": True,
     "pulsed": True,
 }
 WITH = {
+    **{name: {"wavelength_nm": 850.0} for name in ("band", "filtered", "refocused")},
     "regions": {"densities": (0.1, 0.5)},
     "on_for_s": {"interval_s": 60.0},
     "temperatures_c": {"interval_s": 60.0},

@@ -45,6 +45,7 @@ from pixmetry.locate.target_estimator import TargetEstimator, parse_estimator
 from pixmetry.observe.covered import BorderFrames, covered_pixels
 from pixmetry.observe.observe import Group, observe
 from pixmetry.observe.one_pass import without_levels
+from pixmetry.series.bands import measure_bands
 from pixmetry.series.job import measure_motion, measure_series
 from pixmetry.series.views import measure_views
 
@@ -316,6 +317,8 @@ def observe_campaign(campaign: Campaign, progress: Progress) -> tuple[InputHashe
         seen = _with_motion(seen, campaign, moving, reader, on_frames)
     if sides := [g for g in followed if g.kind == "views"]:
         seen = _with_views(seen, campaign, sides, reader, on_frames)
+    if coloured := [g for g in followed if g.kind == "bands"]:
+        seen = _with_bands(seen, campaign, coloured, reader, on_frames)
     fit = seen.photon_transfer_fit
     gain = fit["gain_dn_per_e"].value if fit is not None and "gain_dn_per_e" in fit else None
     known = fit is not None and {"saturation_dn", "offset_dn"} <= set(fit.names)
@@ -391,6 +394,32 @@ def _with_views(
         note = f"the views of targets tell nothing: {problem}"
         return replace(seen, failed={**seen.failed, "views": problem.what}, notes=(*seen.notes, note))
     return replace(seen, views=found, notes=(*seen.notes, *(f"Views of targets: {n}" for n in found.notes)))
+
+
+def _with_bands(
+    seen: Observations, campaign: Campaign, groups: Sequence[FrameGroup], reader: FrameReader, on_frames: Callable[[int], object]
+) -> Observations:
+    """What frames of the same targets in light of several wavelengths tell; each group is a band."""
+    bands = [
+        (
+            [(path.name, partial(reader.fetch, path)) for path in g.paths],
+            {
+                "wavelength_nm": g.facts.wavelength_nm,
+                "name": g.facts.band or "",
+                "filtered": bool(g.facts.filtered),
+                "refocused": bool(g.facts.refocused),
+                "exposure_s": g.exposure_s,
+                "on_frames": on_frames,
+            },
+        )
+        for g in groups
+    ]
+    try:
+        found = measure_bands(bands, campaign.frame_shape, campaign.stated, bits=campaign.bits)
+    except MeasureError as problem:
+        note = f"the bands tell nothing: {problem}"
+        return replace(seen, failed={**seen.failed, "bands": problem.what}, notes=(*seen.notes, note))
+    return replace(seen, bands=found, notes=(*seen.notes, *(f"Bands: {n}" for n in found.notes)))
 
 
 def _shading(seen: Observations) -> float:

@@ -11,6 +11,7 @@ from pixmetry.assess.self_test import SelfTest
 from pixmetry.budget.monte_carlo import Crop
 from pixmetry.budget.records import SUM, Budget
 from pixmetry.camera.camera import Camera
+from pixmetry.camera.colour_bands import ColourBands
 from pixmetry.camera.frame_sequence import FrameSequences
 from pixmetry.camera.observations import (
     ActiveArea,
@@ -123,6 +124,7 @@ class Assessment:
             "response": None if self.observations.response is None else response_record(self.observations.response),
             "series": None if self.observations.drift is None else drift_record(self.observations.drift),
             "motion": None if self.observations.motion is None else motion_record(self.observations.motion),
+            "bands": None if self.observations.bands is None else bands_record(self.observations.bands),
             "views": None if self.observations.views is None else views_record(self.observations.views),
             "speckle": None if self.observations.speckle is None else speckle_record(self.observations.speckle),
             "covered": None if self.observations.covered is None else covered_record(self.observations.covered),
@@ -358,6 +360,37 @@ def covered_record(found: CoveredPixels) -> dict[str, Any]:
     noise = [{"exposure_s": exposure_s, "row_noise_dn": value, "u": u} for exposure_s, value, u in found.row_noise]
     told = {name: why for name, why in found.fit.reasons.items() if name not in found.fit}
     return {"borders": asdict(found.covered), "values": found.fit.to_records(), "not_told": told, "trails": trails, "row_noise": noise}
+
+
+def bands_record(found: ColourBands) -> dict[str, Any]:
+    """The plain record of targets in light of several wavelengths: values, and a line for each band."""
+
+    def number(value: float) -> float | None:
+        return float(value) if np.isfinite(value) else None
+
+    columns = (
+        *("level_dn_per_s", "u_level_dn_per_s", "blur_var_px2", "u_blur_var_px2", "radius_px", "shift_x_px", "shift_y_px", "scale_rel"),
+        *("u_scale_rel", "focus_um"),
+    )
+    bands = [
+        {
+            "wavelength_nm": float(found.wavelength_nm[k]),
+            "band": found.names[k] or None,
+            "filtered": bool(found.filtered[k]),
+            "frames": int(found.frames[k]),
+            "targets": int(found.targets[k]),
+            **{name: number(getattr(found, name)[k]) for name in columns},
+        }
+        for k in range(len(found.wavelength_nm))
+    ]
+    through = zip(found.transmittance_nm.tolist(), found.transmittance.tolist(), found.u_transmittance.tolist(), strict=True)
+    return {
+        "bands": bands,
+        "transmittance": [{"wavelength_nm": nm, "value": value, "u": u} for nm, value, u in through],
+        "colour": _joint_record(found.colour),
+        "diffusion": _joint_record(found.diffusion),
+        "filter": _joint_record(found.filter),
+    }
 
 
 def views_record(found: TargetViews) -> dict[str, Any]:

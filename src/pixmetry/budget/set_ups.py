@@ -167,6 +167,19 @@ SET_UPS = {
             "dots",
         ),
         SetUp(
+            "bands",
+            "The same targets in light of several wavelengths",
+            "The chart all over the frame, lit by one narrow-band lamp after the other; camera, lens and chart at rest, not focused anew. "
+            "With the filter and without it, if there is one.",
+            "White at 70 % of saturation in each light; the exposure may differ.",
+            "lateral colour to 1e-7 per nm",
+            (
+                *(_series("bands", 8, exposure_s=f"<t{k}>", wavelength_nm=f"<nm {k}>") for k in range(1, 5)),
+                _series("bands", 8, exposure_s="<t5>", wavelength_nm="<nm 5>", filtered=True),
+            ),
+            "dots",
+        ),
+        SetUp(
             "views",
             "Targets from several sides",
             "The chart, or the targets of the measurement, from 8 sides up to the most oblique one; or one view, lit from 8 sides.",

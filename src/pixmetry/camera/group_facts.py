@@ -37,6 +37,12 @@ class GroupFacts:
         Whether the frames were recorded (on video tape, or as a video file) and played again.
     pulsed : bool or None
         Whether moving targets are in the light of two pulses, one for each field.
+    band : str or None
+        Name of the light of a band, such as that of its lamp.
+    filtered : bool or None
+        Whether a filter was in front of the lens or the sensor.
+    refocused : bool or None
+        Whether the lens was focused anew for this band.
     """
 
     wavelength_nm: float | None = None
@@ -52,3 +58,6 @@ class GroupFacts:
     on_for_s: float | None = None
     recorded: bool | None = None
     pulsed: bool | None = None
+    band: str | None = None
+    filtered: bool | None = None
+    refocused: bool | None = None

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from pixmetry.camera.code_table import CodeTable
+from pixmetry.camera.colour_bands import ColourBands
 from pixmetry.camera.covered import Covered
 from pixmetry.camera.drift_series import DriftSeries
 from pixmetry.camera.frame_sequence import FrameSequences
@@ -798,6 +799,7 @@ class Observations:
     speckle: SpeckleFrames | None = None
     sequences: FrameSequences | None = None
     views: TargetViews | None = None
+    bands: ColourBands | None = None
     failed: Mapping[str, str] = field(default_factory=dict)  # by kind of frames: why they tell nothing
     storage: Storage = Storage()
     notes: tuple[str, ...] = field(default_factory=tuple)

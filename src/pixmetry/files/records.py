@@ -34,8 +34,9 @@ TARGETS = (
     "speckle",
     "sequence",
     "views",
+    "bands",
 )  # pictures of something to measure; one frame may be enough
-LOCATED = ("series", "motion", "views")  # kinds whose frames are measured one by one, for their targets
+LOCATED = ("series", "motion", "views", "bands")  # kinds whose frames are measured one by one, for their targets
 LOSSY = ("pattern", "speckle")  # kinds whose files may be JPEG
 FACTS = {  # what else may be said of a group, by its kind
     "edge": ("wavelength_nm",),
@@ -46,6 +47,7 @@ FACTS = {  # what else may be said of a group, by its kind
     "series": ("times_s", "interval_s", "on_for_s", "temperatures_c"),
     "motion": ("times_s", "interval_s", "pulsed"),
     "speckle": ("wavelength_nm",),
+    "bands": ("wavelength_nm", "band", "filtered", "refocused"),
     "sequence": ("times_s", "interval_s"),
 }
 

@@ -118,6 +118,7 @@ class GroupModel(Model):
         "speckle",
         "sequence",
         "views",
+        "bands",
     ]
     exposure_s: Annotated[float, Field(ge=0)] | None = None
     photons: Annotated[float, Field(ge=0)] | None = None
@@ -136,6 +137,9 @@ class GroupModel(Model):
     on_for_s: Annotated[float, Field(ge=0)] | None = None
     recorded: bool | None = None
     pulsed: bool | None = None
+    band: Text | None = None
+    filtered: bool | None = None
+    refocused: bool | None = None
     files: Names
 
     @model_validator(mode="before")
@@ -197,6 +201,14 @@ class GroupModel(Model):
             raise InputError(what, allowed="times_s (one for each frame) or interval_s", remedy="give one of them")
         if self.kind == "sequence" and self.times_s is not None and self.interval_s is not None:
             raise InputError("times are given twice", allowed="times_s or interval_s", remedy="delete one of them")
+        return self
+
+    @model_validator(mode="after")
+    def _band(self) -> GroupModel:
+        if self.kind == "bands" and self.wavelength_nm is None:
+            raise InputError(
+                "frames of kind bands without wavelength", allowed="wavelength_nm of the band's light", remedy="add wavelength_nm"
+            )
         return self
 
     def facts(self) -> GroupFacts:

@@ -224,8 +224,8 @@ def _angles(views: Sequence[View], pitch_ratio: float) -> tuple[Array, Array]:
         count = len(e)
         mean = e.mean(axis=0)
         u = float(np.sqrt((each**2).mean() / count))
-        if count > 2:
-            u = max(u, float(np.sqrt(e.var(axis=0, ddof=1).mean() / count)))
+        if count > 2:  # the fitted slopes of the light widen the u of the places, but not that of the outline's shape
+            u = max(0.6 * u, float(np.sqrt(e.var(axis=0, ddof=1).mean() / count)))
         size = float(np.sqrt(max(mean @ mean - u**2, 0.0)))
         ratio = np.sqrt((1 - size) / (1 + size))
         angles.append(np.degrees(np.arccos(ratio)))

@@ -88,6 +88,7 @@ def _plots(assessment: Assessment) -> Section:
 def _pictures(assessment: Assessment) -> list[Section]:
     """A section for each kind of pictures."""
     from pixmetry.assess.page.active_area import area_section
+    from pixmetry.assess.page.bands import bands_section
     from pixmetry.assess.page.blocks import blocks_section
     from pixmetry.assess.page.covered import covered_section
     from pixmetry.assess.page.dark_temperature import dark_temperature_section
@@ -117,6 +118,7 @@ def _pictures(assessment: Assessment) -> list[Section]:
         *([] if seen.motion is None else [motion_section(seen.motion)]),
         *([] if seen.speckle is None else [speckle_section(seen.speckle)]),
         *([] if seen.views is None else [views_section(seen.views)]),
+        *([] if seen.bands is None else [bands_section(seen.bands)]),
     ]
 
 

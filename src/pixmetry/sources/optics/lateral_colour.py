@@ -9,8 +9,10 @@ import numpy as np
 from pixmetry.camera.contribution import Contribution, Probe
 from pixmetry.camera.geometry import frame_centre, image_shift, map_contribution
 from pixmetry.camera.light import Pull
+from pixmetry.camera.observations import Observations, of_pictures
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 
 
@@ -47,6 +49,19 @@ def truth(params: LateralColour, signal: Signal, stream: Stream) -> Mapping[str,
     return {name: shift[0] for name, shift in image_shift(pull_of(params, signal.frame_shape), signal).items()}
 
 
+def measure(observations: Observations) -> Estimates:
+    """Change of the scale per nanometre, from the same targets in light of several wavelengths."""
+    bands, failed = observations.bands, observations.failed.get("bands", "")
+    return of_pictures(
+        None if bands is None else bands.colour,
+        {"scale_per_nm": "scale_per_nm"},
+        where="optics.lateral_colour",
+        pictures="targets in light of several wavelengths",
+        kind="bands",
+        failed=failed,
+    )
+
+
 def propagate(params: LateralColour, probe: Probe) -> Contribution:
     """Propagator P6: the displacement of targets all over the frame."""
     return map_contribution(pull_of(params, probe.frame_shape), probe)
@@ -65,6 +80,7 @@ SOURCE = Source(
     bound=LateralColour(scale_per_nm=5e-6, mean_nm=750.0, std_nm=100.0),
     forward=forward,
     truth=truth,
+    measure=measure,
     propagate=propagate,
     gum_class="G",
     equation="x(λ) = x₀ (1 + m (λ − λ₀));  Δr = r m (λ̄ − λ₀),  σ_r = r m σ_λ",
@@ -72,7 +88,6 @@ SOURCE = Source(
     references=("ISO 19084:2015 (chromatic displacement)",),
     advice="Calibrate and measure under the same narrow-band light.",
     reasons={
-        "measure": "not measured: needs a test field under two kinds of light",
         "correct": "frames are not resampled; positions are corrected instead",
     },
 )

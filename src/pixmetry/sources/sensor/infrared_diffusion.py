@@ -11,11 +11,13 @@ from scipy.special import k1
 
 from pixmetry.camera.geometry import corner_px, frame_centre, image_shift
 from pixmetry.camera.light import Pull
+from pixmetry.camera.observations import Observations, of_pictures
 from pixmetry.camera.raster import spread_of
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.silicon import absorption_per_um, refractive_index
 from pixmetry.camera.source import Parameters, Source, quantity
 from pixmetry.core.arrays import Array
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 
 
@@ -108,6 +110,24 @@ def truth(params: InfraredDiffusion, signal: Signal, stream: Stream) -> Mapping[
     return {name: shift[0] for name, shift in image_shift(pull_of(params, signal.frame_shape), signal).items()}
 
 
+def measure(observations: Observations) -> Estimates:
+    """Diffusion length, or its limit, from the blur of targets in infrared light against that in visible light."""
+    bands, failed = observations.bands, observations.failed.get("bands", "")
+    fit = of_pictures(
+        None if bands is None else bands.diffusion,
+        {"diffusion_length_um": "diffusion_length_um"},
+        where="sensor.infrared_diffusion",
+        pictures="targets in visible and in infrared light",
+        kind="bands",
+        failed=failed,
+    )
+    stated = observations.stated
+    assert bands is not None and stated.pitch_x_um is not None
+    known = [("wavelength_nm", bands.long_nm, "nm"), ("pitch_x_um", stated.pitch_x_um, "µm")]
+    known.append(("pitch_y_um", stated.pitch_y_um or stated.pitch_x_um, "µm"))
+    return fit.join(Estimates.from_rows([(name, value, 0.0, np.inf, unit) for name, value, unit in known]))
+
+
 SOURCE = Source(
     id="sensor.infrared_diffusion",
     title="Infrared light and charge diffusion",
@@ -121,6 +141,7 @@ SOURCE = Source(
     bound=InfraredDiffusion(wavelength_nm=940.0, diffusion_length_um=30.0, chief_ray_deg=15.0),
     forward=forward,
     truth=truth,
+    measure=measure,
     gum_class="G",
     equation="η(k) = 1 − exp(−α w)/(1 + α L_k),  1/L_k² = 1/L² + (2πk)²;  Δr = ⟨z⟩ tan θ',  sin θ' = sin θ/n",
     typical_size="0.03 px outwards in the corners for 10 µm of depth under 5° in air (8.6 µm pixels)",
@@ -131,7 +152,6 @@ SOURCE = Source(
     ),
     advice="Put an infrared-cut filter in front of the sensor, or use light below 650 nm.",
     reasons={
-        "measure": "not measured: needs the slanted-edge experiment at two wavelengths",
         "correct": "frames are not deconvolved; the outward shift is part of the calibrated distortion",
         "propagate": "it changes the sampling of the target; that needs the target before the spread, which the probe does not contain",
     },
