@@ -1,0 +1,449 @@
+"""A recorder by one scene at rest, seen directly and after it was recorded: a video coder, or a video tape.
+
+What a lossless recorder stores is the frames themselves: noise, contrast and places of the rows are as before. A lossy video coder stores
+no change that is below its rounding step: noise freezes until the next picture that is coded by itself. A tape limits the bandwidth, adds
+noise, and its lines come early or late.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from pixmetry.camera.recordings import Recordings
+from pixmetry.core.arrays import Array
+from pixmetry.core.errors import InputError, MeasureError
+from pixmetry.core.number import ONE_SIDED_95, Estimates
+from pixmetry.observe.line_jitter import RowSeries, fit_jitter
+from pixmetry.sources.storage.tape import BESSEL_3
+from pixmetry.sources.storage.video_codec import DEPTHS, Coder, VideoCodec
+
+LEAST_FRAMES = 8  # of each: for noise, and to see a group of pictures
+MOST_SIDE, MOST_TRIED = 256, 12  # px of the part in the middle of the frames, and number of frames, on which a coder is tried
+SIGNIFICANT = 3.0
+JUMP = 5.0  # robust standard deviations by which the difference to a picture coded by itself stands out
+FREEZES = 0.02  # of the noise variance: what a lossy coder takes away at least
+BLOCK = 4  # px, the smallest that is transformed
+LUMPY, TILT = 0.15, 0.03  # by which the kurtosis of the noise rises, and the logarithm of its coarse over its fine part
+CODERS: tuple[tuple[Any, Any], ...] = (("h264", "qp"), ("h264", "crf"), ("hevc", "qp"), ("hevc", "crf"))
+COARSEST_FIRST = 2
+QUALITIES, COARSE = (1, 51), 3  # quantisers, and the step of those that are tried first
+MISFIT, ALIKE = 0.05, 0.003  # sum of squares of the logarithms of four traces: of another coder; of quantisers that are not told apart
+CLEARLY = 0.25  # of the misfit three quantisers off, above which the best one is not the right one
+U_QUALITY = 1.0  # one coder decides not quite as another
+LEAST_CONTRAST = 30.0  # of the scene's power over that of the noise, at a frequency that is compared
+BANDS = 48  # frequencies along a row
+ALIKE_MISFIT = 1.3  # ratio of sums of squares, below which a staircase and a smooth line are not told apart
+BLOCKS = 8  # parts of the rows whose scatter is the u of the bandwidth
+LEAST_ROWS = 0.25  # share of the rows that show where they are, for their jitter
+EDGE_PX = 4  # of a row to either side, that are left out
+ROW_U_PX = 0.25  # of the place of one row, above which it shows nothing
+DIGITAL_ONLY, ANALOGUE_ONLY = "a tape records an analogue signal: the camera is digital", "a coder behind a tape is not told from the tape"
+METHOD = "one scene at rest, directly and recorded: noise from frame to frame, contrast along the rows, places of the rows"
+CODER = "quantiser with which a coder (libx264, libx265) leaves such noise of the direct frames"
+LOSSLESS = "noise is as before, and does not freeze: the recorder loses nothing that these frames show"
+
+
+def recordings_of(
+    direct: Sequence[np.ndarray], recorded: Sequence[np.ndarray], *, analogue: bool = False, depth_bits: int = 8
+) -> Recordings:
+    """What a recorder changes.
+
+    Parameters
+    ----------
+    direct, recorded : sequence of ndarray, shape (rows, cols), DN
+        Frames of one scene at rest, each in the order in which they were taken.
+    analogue : bool
+        Whether the recorder is a tape, in front of the frame grabber.
+    depth_bits : int
+        Bits of a stored value.
+
+    Returns
+    -------
+    Recordings
+
+    Raises
+    ------
+    MeasureError
+        With fewer than eight frames of each.
+    """
+    if min(len(direct), len(recorded)) < LEAST_FRAMES:
+        what = f"{len(direct)} frames came directly and {len(recorded)} were recorded, {LEAST_FRAMES} of each are needed"
+        raise MeasureError(what, where="recording", remedy="take more frames of the same scene, which does not move")
+    before, after = (np.array(frames, np.float32) for frames in (direct, recorded))
+    squares = [0.5 * np.square(np.diff(f, axis=0)).mean(axis=(1, 2), dtype=float) for f in (before, after)]
+    noise, correlation = _noise(before, after)
+    means = [f.mean(axis=0, dtype=float) for f in (before, after)]
+    _same_scene(*means)
+    frequency, transfer, u_transfer, parts = _transfer(
+        *means, [float(v.mean()) / len(f) for v, f in zip(squares, (before, after), strict=True)]
+    )
+    fit = noise.join(correlation)
+    played = straight = Estimates.empty()
+    step = np.full(len(means[0]), np.nan)
+    if analogue:
+        played, straight = row_jitter_of(after), row_jitter_of(before)
+        jitter = [
+            sum(n.value**2 for n in e if n.unit == "px" and n.name in ("white_px", "loop_px") and not n.is_limit)
+            for e in (played, straight)
+        ]
+        band, held = _bandwidth(frequency, parts, max(jitter[0] - jitter[1], 0.0))
+        expected = means[0]
+        if "bandwidth_rel" in band:
+            own = float(band["bandwidth_rel"].value)
+            expected = _waved(
+                expected,
+                np.zeros(len(expected)),
+                gain=lambda f: bessel_gain(f, own, held=held) * np.exp(-2 * (np.pi * f) ** 2 * jitter[0]),
+            )
+        step = row_shifts(means[1][None], expected, passes=3)[0]
+        fit = fit.join(band, _added_noise(before, after), _head_switch(step), _untold(("quality", "group"), ANALOGUE_ONLY))
+    else:
+        fit = fit.join(_coder(before, after, squares[1], noise, correlation, depth_bits))
+        fit = fit.join(_untold(("bandwidth_rel", "noise_dn", "head_switch_px"), DIGITAL_ONLY))
+    return Recordings(
+        len(direct), len(recorded), frequency, transfer, u_transfer, squares[1], float(squares[0].mean()), step, fit, played, straight
+    )
+
+
+def _untold(names: Sequence[str], why: str) -> Estimates:
+    return Estimates.from_rows([], reasons=dict.fromkeys(names, why))
+
+
+def _same_scene(direct: Array, recorded: Array) -> None:
+    """Refuse frames of two scenes."""
+    one, other = direct - direct.mean(), recorded - recorded.mean()
+    alike = float((one * other).sum() / np.sqrt((one**2).sum() * (other**2).sum() + 1e-12))
+    if alike < 0.5:
+        remedy = "show the same scene in both, with texture or edges, and let nothing move"
+        raise MeasureError("the recorded frames show another scene, or one without contrast", where="recording", remedy=remedy)
+
+
+def _noise(before: Array, after: Array) -> tuple[Estimates, Estimates]:
+    """Ratio of the temporal variances, and correlation of the noise from frame to frame beyond that of the direct frames; u by blocks."""
+
+    def of_blocks(values: Array) -> Array:
+        rows, cols = (n // 4 for n in values.shape)
+        return np.array(
+            [values[i * rows : (i + 1) * rows, j * cols : (j + 1) * cols].mean(dtype=float) for i in range(4) for j in range(4)]
+        )
+
+    variances, correlations = [], []
+    for f in (before, after):
+        own = of_blocks(f.var(axis=0, ddof=1))
+        near = of_blocks((0.5 * np.square(np.diff(f, axis=0))).mean(axis=0))
+        variances.append(own)
+        correlations.append(1 - near / np.maximum(own, 1e-12))
+    ratio = variances[1] / np.maximum(variances[0], 1e-12)
+    share = correlations[1] - correlations[0]
+    rows = [("noise_ratio", float(np.average(ratio, weights=variances[0])), float(ratio.std(ddof=1)) / 4, 15.0, "1")]
+    other = [("frame_correlation", float(share.mean()), float(share.std(ddof=1)) / 4, 15.0, "1")]
+    return Estimates.from_rows(rows, method=METHOD), Estimates.from_rows(other, method=METHOD)
+
+
+def _transfer(direct: Array, recorded: Array, noise_dn2: Sequence[float]) -> tuple[Array, Array, Array, Array]:
+    """Contrast along the rows after over before, by frequency; of all rows, its u, and of blocks of rows (blocks, n).
+
+    The cross spectrum over the power of the direct mean image, less that of its noise; sizes of complex means over the rows, so that what
+    moves single rows lowers it.
+    """
+    cols = direct.shape[1]
+    window = np.hanning(cols)
+    spectra = [np.fft.rfft((m - m.mean(axis=1, keepdims=True)) * window, axis=1) for m in (direct, recorded)]
+    power, cross = np.abs(spectra[0]) ** 2, np.conj(spectra[0]) * spectra[1]
+    own = noise_dn2[0] * float((window**2).sum())
+    edges = np.linspace(1, cols // 2 + 1, BANDS + 1).astype(int)
+    frequency = np.array([(a + b - 1) / 2 / cols for a, b in zip(edges[:-1], edges[1:], strict=True)])
+    parts = np.full((BLOCKS, BANDS), np.nan)
+    # of all rows a delay that is common to them turns the phase by as much per frequency
+    blocks = np.array_split(np.arange(len(direct)), BLOCKS)
+    for b, rows in enumerate(blocks):
+        for k, (first, end) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
+            p = power[rows, first:end].sum(axis=0)
+            if p.sum() > LEAST_CONTRAST * own * len(rows) * (end - first):
+                parts[b, k] = float(np.abs(cross[rows, first:end].sum(axis=0)).sum() / (p.sum() - own * len(rows) * (end - first)))
+    seen = np.isfinite(parts).sum(axis=0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean = np.where(seen > 1, np.nansum(parts, axis=0) / np.maximum(seen, 1), np.nan)
+        spread = np.sqrt(np.nansum((parts - mean) ** 2, axis=0) / np.maximum(seen - 1, 1) / np.maximum(seen, 1))
+    return frequency, mean, np.where(seen > 1, spread, np.nan), parts
+
+
+def bessel_gain(frequency: Array, bandwidth: float, *, held: bool = False) -> Array:
+    """Gain of a Bessel filter of third order, −3 dB at the bandwidth, at frequencies in cycles per pixel.
+
+    ``held``: of a staircase of pixels that is sampled in their middles behind the filter: Σ H(f + m) sinc(f + m), by which the steps of
+    the staircase are folded back (the filter's delay is common to picture and line pulses).
+    """
+    late = float(np.real(-1 / BESSEL_3).sum())  # of low frequencies, rad per f/bandwidth
+    total = np.zeros(np.shape(frequency), complex)
+    for m in (-2, -1, 0, 1, 2) if held else (0,):
+        f = (frequency + m) / bandwidth
+        one = np.prod([-p / (1j * f - p) for p in BESSEL_3], axis=0) * np.exp(1j * f * late)
+        total += one * (np.sinc(frequency + m) if held else 1.0)
+    gain: Array = np.abs(total)
+    return gain
+
+
+def _bandwidth(frequency: Array, parts: Array, jitter_px2: float) -> tuple[Estimates, bool]:
+    """Bandwidth in cycles per pixel, by the contrast of blocks of rows; and whether it follows the staircase of the camera's pixels.
+
+    Of one recording: of copies of copies each has a wider one. Rows that jitter blur the mean image by as much more. Without a filter ahead
+    of the recorder the line is a staircase of pixels, whose steps the recorder's filter averages and samples taken directly do not: a sinc.
+    What describes the contrast better is taken.
+    """
+    from scipy.optimize import minimize_scalar
+
+    ways = []
+    for held in (False, True):
+        known = np.exp(-2 * (np.pi * frequency) ** 2 * jitter_px2)
+        found, misfits = [], 0.0
+        for part in parts:
+            seen = np.isfinite(part)
+            if seen.sum() < 4:
+                continue
+
+            def misfit(logarithm: float, part: Array = part, seen: np.ndarray = seen, known: Array = known, held: bool = held) -> float:
+                model = known[seen] * bessel_gain(frequency[seen], float(np.exp(logarithm)), held=held)
+                scale = float(model @ part[seen] / (model @ model))
+                return float(((part[seen] - scale * model) ** 2).sum())
+
+            best = minimize_scalar(misfit, bounds=(np.log(0.02), np.log(5.0)), method="bounded")
+            found.append(float(best.x))
+            misfits += float(best.fun)
+        ways.append((misfits, np.array(found)))
+    held = ways[1][0] < ways[0][0]
+    logs = ways[held][1]
+    if len(logs) < 3:
+        why = "the scene has too little contrast at high frequencies: show sharp edges or texture"
+        return _untold(("bandwidth_rel",), why), held
+    value, u = float(np.exp(logs.mean())), float(logs.std(ddof=1) / np.sqrt(len(logs)))
+    if max(way[0] for way in ways) < ALIKE_MISFIT * min(way[0] for way in ways):
+        u = float(np.hypot(u, (ways[1][1].mean() - ways[0][1].mean()) / np.sqrt(12)))
+    if value * (1 - SIGNIFICANT * u) > 0.5 * 3:
+        what = "the contrast hardly falls up to the highest frequency of the pixels; 95 % lower limit"
+        row = ("bandwidth_rel", value * float(np.exp(-ONE_SIDED_95 * u)), value * u, len(logs) - 1.0, "cycles/px")
+        found_limit = Estimates.from_rows([row], method=METHOD, lower_limits=frozenset(["bandwidth_rel"]), reasons={"bandwidth_rel": what})
+        return found_limit, held
+    return Estimates.from_rows([("bandwidth_rel", value, value * u, len(logs) - 1.0, "cycles/px")], method=METHOD), held
+
+
+def _added_noise(before: Array, after: Array) -> Estimates:
+    """Standard deviation of the noise that a tape adds where the scene is even: variance after less before, at no slope along the row.
+
+    Rows that come early or late make noise in proportion to the square of the slope: the intercept is without it. u is the scatter of 16
+    parts of the frame. The noise of the camera itself passes the tape, too, and loses what lies beyond its bandwidth: the variance of the
+    direct frames is that after a filter of the same gain, which the caller's frames do not tell; so it bounds what was added from below
+    and above, and u holds that.
+    """
+    slope = np.square(np.gradient(after.mean(axis=0, dtype=float), axis=1))
+    variances = [f.var(axis=0, ddof=1).astype(float) for f in (after, before)]
+    found = []
+    for rows in np.array_split(np.arange(slope.shape[0]), 4):
+        for cols in np.array_split(np.arange(slope.shape[1]), 4):
+            part = np.ix_(rows, cols)
+            design = np.column_stack([np.ones(slope[part].size), slope[part].ravel()])
+            weight = 1 / (1 + design[:, 1] / max(float(np.median(design[:, 1])), 1e-9))
+            own = [float(np.linalg.lstsq(design * weight[:, None], v[part].ravel() * weight, rcond=None)[0][0]) for v in variances]
+            found.append(own)
+    after_dn2, before_dn2 = np.array(found).T
+    most, least = after_dn2, after_dn2 - before_dn2  # if the tape lets nothing of the camera's noise pass, or all of it
+    square = float(0.5 * (most + least).mean())
+    half = float(0.5 * before_dn2.mean())
+    u = float(np.hypot((most + least).std(ddof=1) / 8, half / np.sqrt(3)))
+    if square < SIGNIFICANT * u:
+        limit = float(np.sqrt(max(square, 0.0) + ONE_SIDED_95 * u))
+        why = {"noise_dn": "no more noise than the camera itself may have; 95 % upper limit"}
+        return Estimates.from_rows(
+            [("noise_dn", limit, u / (2 * limit), 15.0, "DN")], method=METHOD, limits=frozenset(["noise_dn"]), reasons=why
+        )
+    value = float(np.sqrt(square))
+    return Estimates.from_rows([("noise_dn", value, u / (2 * value), 15.0, "DN")], method=METHOD)
+
+
+def row_shifts(frames: Array, mean: Array, cols: slice = slice(None), passes: int = 1) -> Array:
+    """By how much each row of each frame lies to the right of the same row of a mean image, shape (frames, rows), px.
+
+    Least squares of the difference on the slope of the mean image and a constant, about the shift that was found before; NaN where the
+    slope tells less than a quarter of a pixel. Slopes are those of the wave through the pixels: a difference of neighbours is too small.
+    """
+    m = mean[:, cols]
+    inner = slice(EDGE_PX, m.shape[1] - EDGE_PX)
+    shift = np.zeros(frames.shape[:2])
+    for k in range(passes):
+        moved = np.array([_waved(m, s) for s in shift]) if k else m[None]
+        slope = (
+            np.array([_waved(m, s, slope=True) for s in shift])[:, :, inner]
+            if k
+            else _waved(m, np.zeros(len(m)), slope=True)[None, :, inner]
+        )
+        slope = slope - slope.mean(axis=2, keepdims=True)
+        energy = (slope**2).sum(axis=2)
+        off = frames[:, :, cols][:, :, inner] - moved[:, :, inner]
+        off = off - off.mean(axis=2, keepdims=True)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            step = -(off * slope).sum(axis=2) / energy
+            u = np.sqrt(np.square(off + step[..., None] * slope).mean(axis=2).mean(axis=0) / energy.mean(axis=0))
+        shift = np.where(u < ROW_U_PX, shift + step, 0.0)
+    return np.where(u < ROW_U_PX, shift, np.nan)
+
+
+def _waved(image: Array, shift: Array, *, slope: bool = False, gain: Callable[[Array], Array] | None = None) -> Array:
+    """Rows shifted to the right, or their slopes, or filtered: by the waves through them and their mirror images."""
+    both = np.concatenate([image, image[:, ::-1]], axis=1)
+    f = np.fft.rfftfreq(both.shape[1])
+    factor = np.exp(-2j * np.pi * f * shift[:, None]) * (2j * np.pi * f if slope else 1.0) * (gain(f) if gain is not None else 1.0)
+    here: Array = np.fft.irfft(np.fft.rfft(both, axis=1) * factor, both.shape[1], axis=1)[:, : image.shape[1]]
+    return here
+
+
+def row_jitter_of(frames: Array) -> Estimates:
+    """Jitter of the rows from frame to frame; what the two halves of a row have in common is the row's."""
+    mean = frames.mean(axis=0, dtype=float)
+    middle = frames.shape[2] // 2
+    halves = [row_shifts(frames, mean, part) for part in (slice(0, middle), slice(middle, None))]
+    seen = np.isfinite(halves[0]).all(axis=0) & np.isfinite(halves[1]).all(axis=0)
+    if seen.mean() < LEAST_ROWS:
+        return _untold(("white_px",), "most rows show nothing upright in both halves of the frame: show texture or upright edges all over")
+    one, other = (h[:, seen] - h[:, seen].mean(axis=1, keepdims=True) for h in halves)
+    few = len(frames) / (len(frames) - 1)
+    noise = float(np.square(one - other).mean()) / 4 * few
+    row = np.flatnonzero(seen)
+    u_rel = float(np.sqrt(2 / max(one.size - one.shape[1], 1)))
+    return fit_jitter([RowSeries(row, 0.5 * (one + other), noise, u_rel, np.zeros(row.size), np.zeros((2, row.size)))])
+
+
+def _head_switch(step_px: Array) -> Estimates:
+    """Step of the rows at the end of both fields, against the rows above; and from which row on it begins."""
+    seen = np.flatnonzero(np.isfinite(step_px))
+    rows = len(step_px)
+    if seen.size < LEAST_ROWS * rows or (seen > rows - 24).sum() < 8:
+        return _untold(("head_switch_px",), "the last rows show nothing upright")
+    values = step_px[seen]
+    above = values[seen < 0.8 * rows]
+    scatter = 1.4826 * float(np.median(np.abs(above - np.median(above))))
+    best, gain = None, 0.0
+    for count in range(2, 61):
+        tail = values[seen >= rows - 2 * count]
+        if tail.size < 4:
+            continue
+        size = float(np.median(tail) - np.median(above))
+        won = tail.size * (np.mean(tail) - np.median(above)) ** 2 / max(scatter, 1e-6) ** 2
+        if won > gain:
+            best, gain = (count, float(np.mean(tail) - np.median(above)), tail.size, size), won
+    if best is None or gain < 25.0 + 2 * np.log(60):
+        limit = ONE_SIDED_95 * scatter
+        why = {"head_switch_px": "no step at the end of the fields"}
+        row = ("head_switch_px", limit, scatter, float(above.size), "px")
+        return Estimates.from_rows([row], method=METHOD, limits=frozenset(["head_switch_px"]), reasons=why)
+    count, size, number, _ = best
+    row = ("head_switch_px", size, scatter * float(np.sqrt(1 / number + 1 / above.size)), float(number - 1), "px")
+    return Estimates.from_rows([row], method=METHOD, settings={"head_switch_rows": count})
+
+
+def group_of(squares: Array) -> int | None:
+    """Number of frames from one picture coded by itself to the next, by the differences to the frame before; None where none stands out.
+
+    The picture coded by itself does not repeat what the others froze: the difference to it is larger, once a group.
+    """
+    median = float(np.median(squares))
+    scatter = max(1.4826 * float(np.median(np.abs(squares - median))), 0.01 * median, 1e-9)
+    high = np.flatnonzero(squares > median + JUMP * scatter)
+    if high.size < 2:
+        return None
+    period = int(np.gcd.reduce(np.diff(high)))
+    return period if period > 1 else None
+
+
+def traces_of(frames: Array) -> Array:
+    """Mean square of the difference to the frame before, its coarse and its fine part in DN², and its kurtosis: medians over the frames.
+
+    Fine parts are rounded to 0 first, and rounding adds to the coarse ones. It leaves few coefficients that are large: noise that was
+    normal then has a kurtosis above 3. Coarse and fine are block coefficients of low and of high order.
+    """
+    differences = np.diff(frames, axis=0)
+    rows, cols = (n // BLOCK * BLOCK for n in frames.shape[1:])
+    tiles = differences[:, :rows, :cols].reshape(len(differences), rows // BLOCK, BLOCK, cols // BLOCK, BLOCK)
+    transform = cosines(BLOCK)
+    found = np.einsum("ui,krilj,vj->kruvl", transform, tiles, transform, optimize=True)
+    second, fourth = (np.mean(found**power, axis=(1, 4)) for power in (2, 4))
+    kurtosis = np.median(fourth / np.maximum(second, 1e-12) ** 2, axis=(1, 2))
+    coarse, fine = second[:, [0, 0, 1], [0, 1, 0]].mean(axis=1), second[:, 2:, 2:].mean(axis=(1, 2))
+    return np.median([np.square(differences).mean(axis=(1, 2), dtype=float), coarse, fine, kurtosis], axis=1)
+
+
+def cosines(size: int) -> Array:
+    """The cosine transform, orthonormal, shape (size, size)."""
+    k, i = np.indices((size, size))
+    return np.where(k == 0, np.sqrt(1 / size), np.sqrt(2 / size)) * np.cos(np.pi * (2 * i + 1) * k / (2 * size))
+
+
+def _coder(before: Array, after: Array, squares: Array, noise: Estimates, correlation: Estimates, depth_bits: int) -> Estimates:
+    """Group and quantiser of a lossy coder, or that the recorder loses nothing."""
+    ratio, alike = noise["noise_ratio"], correlation["frame_correlation"]
+    group = group_of(squares)
+    was, told_of = traces_of(before), traces_of(after)
+    values = 3 * (len(after) - 1) / 2 * after[0].size / BLOCK**2  # of the coarse coefficients
+    tilted = abs(float(np.log(told_of[1] / told_of[2] * was[2] / was[1]))) > max(TILT, JUMP * float(np.sqrt(8 / values)))
+    lumpy = told_of[3] - was[3] > LUMPY or tilted
+    frozen = alike.value > max(SIGNIFICANT * alike.u, FREEZES)
+    less = ratio.value < 1 - max(FREEZES, SIGNIFICANT * ratio.u)
+    if not (lumpy or frozen or less) and group is None:
+        return Estimates.from_rows([], reasons=dict.fromkeys(("quality", "group"), LOSSLESS))
+    if depth_bits not in (8, 10):
+        return _untold(("quality", "group"), "frames of more than 10 bits: H.264 does not store them; the stream states its setting")
+    if group is None and not frozen:
+        group, told = 1, _untold(("group",), "noise does not freeze: each picture is coded by itself, or finely")
+    elif group is None:
+        what = f"fewer than two pictures coded by themselves are among the {len(after)} recorded frames: take more of them"
+        told = _untold(("group",), what)
+    else:
+        told = Estimates.from_rows([("group", float(group), 0.1, np.inf, "1")], method=METHOD)
+    try:
+        return told.join(_quality(before, told_of, group or len(before), depth_bits))
+    except InputError as problem:
+        return told.join(_untold(("quality",), str(problem)))
+
+
+def _quality(before: Array, wanted: Array, group: int, depth_bits: int) -> Estimates:
+    """Quantiser with which a coder leaves the same traces in the direct frames, by trying."""
+    side = [slice(max(0, (n - MOST_SIDE) // 2 // 16 * 16), max(0, (n - MOST_SIDE) // 2 // 16 * 16) + MOST_SIDE) for n in before.shape[1:]]
+    frames = before[:MOST_TRIED, side[0], side[1]].astype(np.uint8 if depth_bits == 8 else np.uint16)
+    part, whole = traces_of(before[:, side[0], side[1]]), traces_of(before)
+    aim = wanted * part / whole  # in the part of the frames that is tried
+    ways: list[tuple[float, int, dict[int, float], dict[str, str | int]]] = []
+    for codec, control in CODERS:
+        if depth_bits not in DEPTHS[codec]:
+            continue
+        own = _tried(frames, aim, {"codec": codec, "control": control, "group": min(group, 1000), "depth_bits": depth_bits})
+        best = min(own, key=lambda q: own[q])
+        ways.append((own[best], best, own, {"codec": codec, "control": control}))
+        if own[best] < MISFIT:
+            break
+    misfit, best, tried, settings = min(ways, key=lambda way: way[0])
+    farther = min(d for q, d in tried.items() if abs(q - best) >= COARSE)
+    if misfit > max(MISFIT, CLEARLY * farther):
+        return _untold(("quality",), "no quantiser of H.264 or HEVC leaves such noise: another coder, or noise reduction")
+    alike = [q for q, d in tried.items() if d < max(4 * tried[best], ALIKE)]
+    u = float(np.hypot(U_QUALITY, (max(alike) - min(alike)) / np.sqrt(12)))
+    if best - ONE_SIDED_95 * u < QUALITIES[0]:
+        why = {"quality": "so fine that the noise hides it; 95 % upper limit"}
+        row = ("quality", min(best + ONE_SIDED_95 * u, float(QUALITIES[1])), u, np.inf, "1")
+        return Estimates.from_rows([row], method=CODER, limits=frozenset(["quality"]), reasons=why, settings=settings)
+    return Estimates.from_rows([("quality", float(best), u, np.inf, "1")], method=CODER, settings=settings)
+
+
+def _tried(frames: np.ndarray, aim: Array, setting: dict[str, Any]) -> dict[int, float]:
+    """Misfit of the traces by quantiser: every third one, then those near the best."""
+
+    def apart(quality: int) -> float:
+        coder = Coder(VideoCodec(quality=quality, **setting))
+        found = traces_of(np.array([coder.follow(f) for f in frames], np.float32))
+        return float(np.square(np.log(np.maximum(found, 1e-6) / np.maximum(aim, 1e-6))).sum())
+
+    tried = {q: apart(q) for q in range(COARSEST_FIRST, QUALITIES[1] + 1, COARSE)}
+    best = min(tried, key=lambda q: tried[q])
+    near = range(max(QUALITIES[0], best - COARSE + 1), min(QUALITIES[1], best + COARSE - 1) + 1)
+    return tried | {q: apart(q) for q in near if q not in tried}
