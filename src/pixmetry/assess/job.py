@@ -46,7 +46,7 @@ from pixmetry.observe.covered import BorderFrames, covered_pixels
 from pixmetry.observe.observe import Group, observe
 from pixmetry.observe.one_pass import without_levels
 from pixmetry.series.bands import measure_bands
-from pixmetry.series.job import measure_motion, measure_series
+from pixmetry.series.job import measure_motion, measure_recordings, measure_series
 from pixmetry.series.views import measure_views
 
 KIND = "assessment"
@@ -315,6 +315,8 @@ def observe_campaign(campaign: Campaign, progress: Progress) -> tuple[InputHashe
         seen = _with_series(seen, campaign, still, reader, on_frames)
     if moving := [g for g in followed if g.kind == "motion"]:
         seen = _with_motion(seen, campaign, moving, reader, on_frames)
+    if played := [g for g in followed if g.kind == "recording"]:
+        seen = _with_recordings(seen, campaign, played, reader, on_frames)
     if sides := [g for g in followed if g.kind == "views"]:
         seen = _with_views(seen, campaign, sides, reader, on_frames)
     if coloured := [g for g in followed if g.kind == "bands"]:
@@ -377,6 +379,21 @@ def _with_motion(
         note = f"the frames of moving targets tell nothing: {problem}"
         return replace(seen, failed={**seen.failed, "motion": problem.what}, notes=(*seen.notes, note))
     return replace(seen, motion=found)
+
+
+def _with_recordings(
+    seen: Observations, campaign: Campaign, groups: Sequence[FrameGroup], reader: FrameReader, on_frames: Callable[[int], object]
+) -> Observations:
+    """What a scene tells of a recorder, directly and recorded; of several groups the longest of each."""
+    sides = [max((g.paths for g in groups if bool(g.facts.recorded) is played), key=len, default=()) for played in (False, True)]
+    fetches = [[partial(reader.fetch, path) for path in paths] for paths in sides]
+    analogue = campaign.camera.interface == "analogue"
+    try:
+        found = measure_recordings(*fetches, analogue=analogue, bits=campaign.bits, on_frames=on_frames)
+    except MeasureError as problem:
+        note = f"the recordings tell nothing: {problem}"
+        return replace(seen, failed={**seen.failed, "recording": problem.what}, notes=(*seen.notes, note))
+    return replace(seen, recordings=found)
 
 
 def _with_views(

@@ -34,7 +34,7 @@ from pixmetry.core.number import Estimates
 from pixmetry.emva.files.json_format import value_record
 from pixmetry.emva.records import Results
 from pixmetry.files import Campaign
-from pixmetry.series.records import drift_record, motion_record
+from pixmetry.series.records import drift_record, motion_record, recordings_record
 
 RESULTS_SCHEMA = "pixmetry/results/1"
 
@@ -125,6 +125,7 @@ class Assessment:
             "series": None if self.observations.drift is None else drift_record(self.observations.drift),
             "motion": None if self.observations.motion is None else motion_record(self.observations.motion),
             "bands": None if self.observations.bands is None else bands_record(self.observations.bands),
+            "recording": None if self.observations.recordings is None else recordings_record(self.observations.recordings),
             "views": None if self.observations.views is None else views_record(self.observations.views),
             "speckle": None if self.observations.speckle is None else speckle_record(self.observations.speckle),
             "covered": None if self.observations.covered is None else covered_record(self.observations.covered),

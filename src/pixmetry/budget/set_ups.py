@@ -180,6 +180,16 @@ SET_UPS = {
             "dots",
         ),
         SetUp(
+            "recording",
+            "One scene, directly and recorded",
+            "The chart, or any scene with sharp upright edges all over; nothing moves. Once directly, once from the recorder, by the same "
+            "frame grabber.",
+            "White at 70 % of saturation.",
+            "quantiser to 1; bandwidth of a tape to 3 %, its jitter to 3 %",
+            (_series("recording", 16), _series("recording", 32, recorded=True)),
+            "edges",
+        ),
+        SetUp(
             "views",
             "Targets from several sides",
             "The chart, or the targets of the measurement, from 8 sides up to the most oblique one; or one view, lit from 8 sides.",

@@ -20,6 +20,7 @@ from pixmetry.camera.drift_series import DriftSeries
 from pixmetry.camera.frame_sequence import FrameSequences
 from pixmetry.camera.motion_series import MotionSeries
 from pixmetry.camera.noise_covariance import NoiseCovariance, NoiseFilter
+from pixmetry.camera.recordings import Recordings
 from pixmetry.camera.response import Response
 from pixmetry.camera.speckle import SpeckleFrames
 from pixmetry.camera.stated import StatedFacts
@@ -800,6 +801,7 @@ class Observations:
     sequences: FrameSequences | None = None
     views: TargetViews | None = None
     bands: ColourBands | None = None
+    recordings: Recordings | None = None
     failed: Mapping[str, str] = field(default_factory=dict)  # by kind of frames: why they tell nothing
     storage: Storage = Storage()
     notes: tuple[str, ...] = field(default_factory=tuple)
@@ -965,6 +967,18 @@ class Observations:
         """
         fit, failed = None if self.motion is None else self.motion.fit, self.failed.get("motion", "")
         found = of_pictures(fit, names, where=where, pictures="moving targets", kind="motion", failed=failed)
+        return replace(found, settings={name: found.settings[name] for name in settings if name in found.settings})
+
+    def recorder(self, names: Mapping[str, str], *, where: str, settings: Iterable[str] = ()) -> Estimates:
+        """Take a source's parameters ``{parameter: fitted name}`` that a scene tells which was seen directly and recorded.
+
+        Raises
+        ------
+        MeasureError
+            Without such frames, or with the reason why they do not tell any of these.
+        """
+        fit, failed = None if self.recordings is None else self.recordings.fit, self.failed.get("recording", "")
+        found = of_pictures(fit, names, where=where, pictures="one scene, directly and recorded", kind="recording", failed=failed)
         return replace(found, settings={name: found.settings[name] for name in settings if name in found.settings})
 
     def choices(self, source: str) -> Mapping[str, Any]:

@@ -35,8 +35,9 @@ TARGETS = (
     "sequence",
     "views",
     "bands",
+    "recording",
 )  # pictures of something to measure; one frame may be enough
-LOCATED = ("series", "motion", "views", "bands")  # kinds whose frames are measured one by one, for their targets
+LOCATED = ("series", "motion", "views", "bands", "recording")  # kinds whose frames are measured one by one
 LOSSY = ("pattern", "speckle")  # kinds whose files may be JPEG
 FACTS = {  # what else may be said of a group, by its kind
     "edge": ("wavelength_nm",),
@@ -49,6 +50,7 @@ FACTS = {  # what else may be said of a group, by its kind
     "speckle": ("wavelength_nm",),
     "bands": ("wavelength_nm", "band", "filtered", "refocused"),
     "sequence": ("times_s", "interval_s"),
+    "recording": ("recorded",),
 }
 
 

@@ -119,6 +119,7 @@ class GroupModel(Model):
         "sequence",
         "views",
         "bands",
+        "recording",
     ]
     exposure_s: Annotated[float, Field(ge=0)] | None = None
     photons: Annotated[float, Field(ge=0)] | None = None

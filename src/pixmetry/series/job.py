@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from pixmetry.camera.motion_series import MotionSeries
+from pixmetry.camera.recordings import Recordings
 from pixmetry.core.arrays import Array
 from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.progress import Progress, no_progress
@@ -27,6 +28,7 @@ from pixmetry.series.blur import Cut
 from pixmetry.series.log import SeriesLog
 from pixmetry.series.modes import LEAST_TARGETS, field_motion
 from pixmetry.series.motion import Run, find_in_fields, motion_of
+from pixmetry.series.recording import recordings_of
 from pixmetry.series.records import Series
 from pixmetry.series.texture import texture_of
 from pixmetry.series.thermal import thermal_of
@@ -34,6 +36,7 @@ from pixmetry.series.track import FrameTargets, blur_of, find_targets, follow_ta
 from pixmetry.series.warm_up import drift_of
 
 KIND = "series"
+MOST_RECORDED = 40  # frames in memory
 TEXTURE = "texture"
 Fetch = Callable[[], np.ndarray]
 
@@ -316,6 +319,28 @@ def measure_motion(
         found.append(Run(tuple(even), tuple(odd), tuple(cuts), length, flashed))
     with single_threaded_blas():
         return motion_of(found, frame_shape)
+
+
+def measure_recordings(
+    direct: Sequence[Fetch], recorded: Sequence[Fetch], *, analogue: bool, bits: int, on_frames: Callable[[int], object] | None = None
+) -> Recordings:
+    """Measure a recorder by frames of one scene, directly and recorded, given as functions that return them; the first 40 of each are used.
+
+    Raises
+    ------
+    MeasureError
+        As of `pixmetry.series.recording.recordings_of`.
+    """
+
+    def work(fetch: Fetch) -> np.ndarray:
+        frame = fetch()
+        if on_frames is not None:
+            on_frames(1)
+        return frame
+
+    frames = [[work(fetch) for fetch in part] for part in (direct[:MOST_RECORDED], recorded[:MOST_RECORDED])]
+    with single_threaded_blas():
+        return recordings_of(*frames, analogue=analogue, depth_bits=bits)
 
 
 def write_results(found: Series, output: str | Path, of: Sequence[str], inputs: Iterable[Path]) -> Path:

@@ -8,6 +8,7 @@ import numpy as np
 
 from pixmetry.camera.drift_series import DIGITAL, DriftSeries
 from pixmetry.camera.motion_series import MotionSeries
+from pixmetry.camera.recordings import Recordings
 from pixmetry.core.number import LOWER_LIMIT, Estimates, Number
 from pixmetry.report import Column, Page, Section, Table
 from pixmetry.report.drawing import BLUE, GRID, INK, RED, SOFT, canvas, line
@@ -39,6 +40,16 @@ WORDS = {
     "rows_swapped_px": "Odd rows less even rows at rest",
     "separation_s": "Time between the two pulses of light",
     "ambient_share": "Share of steady light beside the pulses",
+    "noise_ratio": "Temporal variance, recorded over direct",
+    "frame_correlation": "Correlation of the recorded noise from frame to frame, less that of the direct one",
+    "group": "Frames from one picture coded by itself to the next",
+    "quality": "Quantiser of the coder",
+    "bandwidth_rel": "Bandwidth (−3 dB)",
+    "noise_dn": "Noise that the tape adds",
+    "head_switch_px": "Step of the rows where the heads switch",
+    "white_px": "Jitter of the rows, independent from row to row",
+    "loop_px": "Jitter of the rows, alike in neighbouring rows",
+    "loop_rows": "Rows of a field over which it is alike",
 }
 TITLES = {
     "shift_x_px": "shift x / px",
@@ -126,11 +137,47 @@ def motion_section(motion: MotionSeries) -> Section:
     return section
 
 
-def _told(fit: Estimates) -> Table:
+def recordings_section(found: Recordings) -> Section:
+    """Figure and values of a scene that was seen directly and recorded."""
+    section = Section("The recorder", name="recording")
+    text = f"One scene in {found.direct_frames} frames directly and in {found.recorded_frames} recorded ones."
+    section.add_text(text).add(recordings_figure(found), _told(found.fit))
+    if len(found.played):
+        section.add(_told(_known(found.played), "What the rows do behind the recorder"))
+        section.add(_told(_known(found.direct), "What the rows do directly"))
+    return section
+
+
+def _known(fit: Estimates) -> Estimates:
+    return fit.select([name for name in fit.names if name in WORDS])
+
+
+def recordings_figure(found: Recordings) -> Figure:
+    """Contrast after over before the recorder, and the difference of each frame to the one before."""
+    with canvas(2.6, ncols=2) as (figure, (left, right)):
+        left.errorbar(found.frequency, found.transfer, 2 * found.u_transfer, color=BLUE, fmt=".", markersize=3, elinewidth=0.6)
+        left.axhline(1.0, color=GRID, linewidth=0.7)
+        left.set_xlabel("frequency along the rows / cycles/px")
+        left.set_ylabel("contrast, recorded over direct")
+        left.set_ylim(bottom=0)
+        frames = np.arange(1, found.difference_dn2.size + 1)
+        line(right, frames, found.difference_dn2, color=BLUE, marker=".", markersize=3)
+        right.axhline(found.direct_difference_dn2, color=RED, linewidth=0.7, linestyle="--")
+        right.set_xlabel("frame")
+        right.set_ylabel("half the mean square of the difference / DN²")
+        right.set_ylim(bottom=0)
+        caption = (
+            "Left: how much contrast the recorder leaves, with ± 2 u. Right: difference of each recorded frame to the one before; the "
+            "dashed line is that of the frames which came directly. A coder freezes noise until the next picture that is coded by itself."
+        )
+        return Figure(figure, "recording", "Contrast and noise behind the recorder, over those of the direct frames.", caption)
+
+
+def _told(fit: Estimates, title: str = "What the series tells") -> Table:
     """Values, limits, and why others are not there."""
     rows: list[list[Any]] = [[WORDS[number.name], number, number.reason] for number in fit]
     rows += [[WORDS[name], Number.not_available("1", why), why] for name, why in untold(fit).items()]
-    return Table("What the series tells", ["Quantity", Column("Value", "number"), "Note"], rows)
+    return Table(title, ["Quantity", Column("Value", "number"), "Note"], rows)
 
 
 def untold(fit: Estimates) -> dict[str, str]:

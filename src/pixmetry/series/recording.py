@@ -75,7 +75,7 @@ def recordings_of(
     before, after = (np.array(frames, np.float32) for frames in (direct, recorded))
     squares = [0.5 * np.square(np.diff(f, axis=0)).mean(axis=(1, 2), dtype=float) for f in (before, after)]
     noise, correlation = _noise(before, after)
-    means = [f.mean(axis=0, dtype=float) for f in (before, after)]
+    means = (before.mean(axis=0, dtype=float), after.mean(axis=0, dtype=float))
     _same_scene(*means)
     frequency, transfer, u_transfer, parts = _transfer(
         *means, [float(v.mean()) / len(f) for v, f in zip(squares, (before, after), strict=True)]
@@ -121,10 +121,10 @@ def _same_scene(direct: Array, recorded: Array) -> None:
         raise MeasureError("the recorded frames show another scene, or one without contrast", where="recording", remedy=remedy)
 
 
-def _noise(before: Array, after: Array) -> tuple[Estimates, Estimates]:
+def _noise(before: np.ndarray, after: np.ndarray) -> tuple[Estimates, Estimates]:
     """Ratio of the temporal variances, and correlation of the noise from frame to frame beyond that of the direct frames; u by blocks."""
 
-    def of_blocks(values: Array) -> Array:
+    def of_blocks(values: np.ndarray) -> Array:
         rows, cols = (n // 4 for n in values.shape)
         return np.array(
             [values[i * rows : (i + 1) * rows, j * cols : (j + 1) * cols].mean(dtype=float) for i in range(4) for j in range(4)]
@@ -230,7 +230,7 @@ def _bandwidth(frequency: Array, parts: Array, jitter_px2: float) -> tuple[Estim
     return Estimates.from_rows([("bandwidth_rel", value, value * u, len(logs) - 1.0, "cycles/px")], method=METHOD), held
 
 
-def _added_noise(before: Array, after: Array) -> Estimates:
+def _added_noise(before: np.ndarray, after: np.ndarray) -> Estimates:
     """Standard deviation of the noise that a tape adds where the scene is even: variance after less before, at no slope along the row.
 
     Rows that come early or late make noise in proportion to the square of the slope: the intercept is without it. u is the scatter of 16
@@ -263,7 +263,7 @@ def _added_noise(before: Array, after: Array) -> Estimates:
     return Estimates.from_rows([("noise_dn", value, u / (2 * value), 15.0, "DN")], method=METHOD)
 
 
-def row_shifts(frames: Array, mean: Array, cols: slice = slice(None), passes: int = 1) -> Array:
+def row_shifts(frames: np.ndarray, mean: Array, cols: slice = slice(None), passes: int = 1) -> Array:
     """By how much each row of each frame lies to the right of the same row of a mean image, shape (frames, rows), px.
 
     Least squares of the difference on the slope of the mean image and a constant, about the shift that was found before; NaN where the
@@ -290,7 +290,7 @@ def row_shifts(frames: Array, mean: Array, cols: slice = slice(None), passes: in
     return np.where(u < ROW_U_PX, shift, np.nan)
 
 
-def _waved(image: Array, shift: Array, *, slope: bool = False, gain: Callable[[Array], Array] | None = None) -> Array:
+def _waved(image: Array, shift: Array, *, slope: bool = False, gain: Callable[[Any], Any] | None = None) -> Array:
     """Rows shifted to the right, or their slopes, or filtered: by the waves through them and their mirror images."""
     both = np.concatenate([image, image[:, ::-1]], axis=1)
     f = np.fft.rfftfreq(both.shape[1])
@@ -299,7 +299,7 @@ def _waved(image: Array, shift: Array, *, slope: bool = False, gain: Callable[[A
     return here
 
 
-def row_jitter_of(frames: Array) -> Estimates:
+def row_jitter_of(frames: np.ndarray) -> Estimates:
     """Jitter of the rows from frame to frame; what the two halves of a row have in common is the row's."""
     mean = frames.mean(axis=0, dtype=float)
     middle = frames.shape[2] // 2
@@ -357,7 +357,7 @@ def group_of(squares: Array) -> int | None:
     return period if period > 1 else None
 
 
-def traces_of(frames: Array) -> Array:
+def traces_of(frames: np.ndarray) -> Array:
     """Mean square of the difference to the frame before, its coarse and its fine part in DN², and its kurtosis: medians over the frames.
 
     Fine parts are rounded to 0 first, and rounding adds to the coarse ones. It leaves few coefficients that are large: noise that was
@@ -371,16 +371,18 @@ def traces_of(frames: Array) -> Array:
     second, fourth = (np.mean(found**power, axis=(1, 4)) for power in (2, 4))
     kurtosis = np.median(fourth / np.maximum(second, 1e-12) ** 2, axis=(1, 2))
     coarse, fine = second[:, [0, 0, 1], [0, 1, 0]].mean(axis=1), second[:, 2:, 2:].mean(axis=(1, 2))
-    return np.median([np.square(differences).mean(axis=(1, 2), dtype=float), coarse, fine, kurtosis], axis=1)
+    traces = np.array([np.square(differences).mean(axis=(1, 2), dtype=float), coarse, fine, kurtosis])
+    return np.asarray(np.median(traces, axis=1), float)
 
 
 def cosines(size: int) -> Array:
     """The cosine transform, orthonormal, shape (size, size)."""
     k, i = np.indices((size, size))
-    return np.where(k == 0, np.sqrt(1 / size), np.sqrt(2 / size)) * np.cos(np.pi * (2 * i + 1) * k / (2 * size))
+    waves: Array = np.where(k == 0, np.sqrt(1 / size), np.sqrt(2 / size)) * np.cos(np.pi * (2 * i + 1) * k / (2 * size))
+    return waves
 
 
-def _coder(before: Array, after: Array, squares: Array, noise: Estimates, correlation: Estimates, depth_bits: int) -> Estimates:
+def _coder(before: np.ndarray, after: np.ndarray, squares: Array, noise: Estimates, correlation: Estimates, depth_bits: int) -> Estimates:
     """Group and quantiser of a lossy coder, or that the recorder loses nothing."""
     ratio, alike = noise["noise_ratio"], correlation["frame_correlation"]
     group = group_of(squares)
@@ -407,7 +409,7 @@ def _coder(before: Array, after: Array, squares: Array, noise: Estimates, correl
         return told.join(_untold(("quality",), str(problem)))
 
 
-def _quality(before: Array, wanted: Array, group: int, depth_bits: int) -> Estimates:
+def _quality(before: np.ndarray, wanted: Array, group: int, depth_bits: int) -> Estimates:
     """Quantiser with which a coder leaves the same traces in the direct frames, by trying."""
     side = [slice(max(0, (n - MOST_SIDE) // 2 // 16 * 16), max(0, (n - MOST_SIDE) // 2 // 16 * 16) + MOST_SIDE) for n in before.shape[1:]]
     frames = before[:MOST_TRIED, side[0], side[1]].astype(np.uint8 if depth_bits == 8 else np.uint16)
@@ -419,7 +421,7 @@ def _quality(before: Array, wanted: Array, group: int, depth_bits: int) -> Estim
             continue
         own = _tried(frames, aim, {"codec": codec, "control": control, "group": min(group, 1000), "depth_bits": depth_bits})
         best = min(own, key=lambda q: own[q])
-        ways.append((own[best], best, own, {"codec": codec, "control": control}))
+        ways.append((own[best], best, own, {"codec": codec, "control": control, "depth_bits": depth_bits}))
         if own[best] < MISFIT:
             break
     misfit, best, tried, settings = min(ways, key=lambda way: way[0])

@@ -5,8 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from pixmetry.camera.drift_series import DriftSeries
 from pixmetry.camera.motion_series import MotionSeries
+from pixmetry.camera.recordings import Recordings
 
 SERIES_SCHEMA = "pixmetry/series/1"
 
@@ -85,4 +88,27 @@ def motion_record(motion: MotionSeries) -> dict[str, Any]:
         "names_of_covariance": list(motion.fit.names),
         "covariance": motion.fit.covariance.tolist(),
         "confounders": list(motion.fit.confounders),
+    }
+
+
+def recordings_record(found: Recordings) -> dict[str, Any]:
+    """The plain record of a scene that was seen directly and recorded."""
+
+    def plain(values: np.ndarray) -> list[float | None]:
+        return [float(v) if np.isfinite(v) else None for v in values]
+
+    return {
+        "direct_frames": found.direct_frames,
+        "recorded_frames": found.recorded_frames,
+        "estimates": found.fit.to_records(),
+        "settings": dict(found.fit.settings),
+        "not_told": {name: why for name, why in found.fit.reasons.items() if name not in found.fit},
+        "row_jitter_recorded": found.played.to_records(),
+        "row_jitter_direct": found.direct.to_records(),
+        "frequency_per_px": found.frequency.tolist(),
+        "transfer": plain(found.transfer),
+        "u_transfer": plain(found.u_transfer),
+        "difference_dn2": plain(found.difference_dn2),
+        "direct_difference_dn2": found.direct_difference_dn2,
+        "row_shift_px": plain(found.step_px),
     }

@@ -100,7 +100,7 @@ def _pictures(assessment: Assessment) -> list[Section]:
     from pixmetry.assess.page.speckle import speckle_section
     from pixmetry.assess.page.spots import spots_section
     from pixmetry.assess.page.views import views_section
-    from pixmetry.series.page import drift_section, motion_section
+    from pixmetry.series.page import drift_section, motion_section, recordings_section
 
     seen = assessment.observations
     return [
@@ -116,6 +116,7 @@ def _pictures(assessment: Assessment) -> list[Section]:
         *([] if seen.sequences is None else [sequence_section(seen.sequences)]),
         *([] if seen.drift is None else [drift_section(seen.drift)]),
         *([] if seen.motion is None else [motion_section(seen.motion)]),
+        *([] if seen.recordings is None else [recordings_section(seen.recordings)]),
         *([] if seen.speckle is None else [speckle_section(seen.speckle)]),
         *([] if seen.views is None else [views_section(seen.views)]),
         *([] if seen.bands is None else [bands_section(seen.bands)]),

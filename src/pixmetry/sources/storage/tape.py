@@ -12,6 +12,7 @@ from pixmetry.camera.contribution import Contribution, Probe, smooth_part
 from pixmetry.camera.line import Line, alike_rows, group_delay_s, reach_px
 from pixmetry.camera.line_contribution import from_row_delays, from_steady_delays, held_of, through_line
 from pixmetry.camera.observations import Observations
+from pixmetry.camera.recordings import Recordings
 from pixmetry.camera.row_delays import added_delays, delays_ns
 from pixmetry.camera.signal import Kind, Signal, Windows
 from pixmetry.camera.source import Parameters, Source, quantity
@@ -21,6 +22,10 @@ from pixmetry.core.number import Estimates
 from pixmetry.core.random import Grid, Stream
 
 SHARE_BEYOND = 1e-4  # of a step, beyond the near context
+CONFOUNDERS = (
+    "the number of copies: their errors grow with its root, and only what all of them add is told",
+    "filters of the frame grabber behind the tape, which take part of its noise",
+)
 PERIODS = 6  # of the bandwidth, to either side, over which the noise is alike
 BESSEL_3 = np.array([-1.32267580, -1.04740916 + 0.99926444j, -1.04740916 - 0.99926444j])  # poles for −3 dB at 1 rad/s
 
@@ -160,7 +165,12 @@ def tail(params: Tape, pixel_hz: float, row_px: int) -> float:
 
 
 def measure(observations: Observations) -> Estimates:
-    """What the rows of upright lines move more when they were played from tape than when they came directly: variances are subtracted."""
+    """What one scene, or the rows of upright lines, show more when they were played from tape than when they came directly.
+
+    Of one recording: copies of copies add to it, and what is told stands for all of them.
+    """
+    if observations.recordings is not None:
+        return _by_recordings(observations, observations.recordings)
     names = {"white_px": "white_px", "loop_px": "loop_px", "loop_rows": "loop_rows"}
     played = observations.row_jitter(names, where="storage.tape", taped=True)
     if observations.lines is None or not len(observations.lines.jitter):
@@ -172,6 +182,25 @@ def measure(observations: Observations) -> Estimates:
     return delays_ns(
         added, {"white": "white_ns", "loop": "wow_ns", "loop_rows": "wow_rows"}, observations.stated.pixel_clock_mhz, where="storage.tape"
     )
+
+
+def _by_recordings(observations: Observations, seen: Recordings) -> Estimates:
+    """Bandwidth, noise, time base and step of the heads, by a scene seen directly and recorded."""
+    where, clock = "storage.tape", observations.stated.pixel_clock_mhz
+    found = observations.recorder(
+        {"bandwidth_mhz": "bandwidth_rel", "noise_dn": "noise_dn", "head_switch_ns": "head_switch_px"},
+        where=where,
+        settings=["head_switch_rows"],
+    )
+    if clock is None:
+        raise MeasureError("told in pixels; a tape needs the clock", where=where, remedy="state pixel_clock_mhz in the manifest")
+    factors = {"bandwidth_mhz": (clock, "MHz"), "head_switch_ns": (1e3 / clock, "ns")}
+    found = found.scaled({name: factor for name, factor in factors.items() if name in found})
+    jitter = Estimates.empty()
+    if "white_px" in seen.played and "white_px" in seen.direct:
+        added = added_delays(seen.played, seen.direct, where=where)
+        jitter = delays_ns(added, {"white": "white_ns", "loop": "wow_ns", "loop_rows": "wow_rows"}, clock, where=where)
+    return replace(found.join(jitter), settings={**found.settings, "generations": 1}, confounders=CONFOUNDERS)
 
 
 def propagate(params: Tape, probe: Probe) -> Contribution:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from fractions import Fraction
 from types import ModuleType
 from typing import Any, Literal
@@ -9,10 +10,12 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import model_validator
 
+from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal, Windows
 from pixmetry.camera.source import Parameters, Source, quantity
-from pixmetry.core.errors import InputError, ParameterError
+from pixmetry.core.errors import InputError, MeasureError, ParameterError
 from pixmetry.core.extras import import_extra
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 
 BLOCK = 16  # px: coded pictures are whole macroblocks; what a frame lacks is completed by repeating its last row and column
@@ -168,6 +171,17 @@ def context(params: VideoCodec, windows: Windows, frame_shape: tuple[int, int]) 
     return windows.full_frame(frame_shape)
 
 
+def measure(observations: Observations) -> Estimates:
+    """Coder, quantiser and group of frames that were recorded, against the same scene seen directly."""
+    where = "storage.video_codec"
+    recorded = observations.recordings
+    group = 0 if recorded is None or "group" not in recorded.fit else int(recorded.fit["group"].value)
+    found = observations.recorder({"quality": "quality"}, where=where, settings=["codec", "control", "depth_bits"])
+    if found["quality"].is_limit:
+        raise MeasureError(f"finer than a quantiser of {found['quality'].value:.0f}: {found.reasons['quality']}", where=where)
+    return replace(found, settings={**found.settings, **({"group": group} if group else {})})
+
+
 SOURCE = Source(
     id="storage.video_codec",
     title="Video compression",
@@ -180,6 +194,7 @@ SOURCE = Source(
     typical=VideoCodec(),
     bound=VideoCodec(quality=32, group=50),
     forward=forward,
+    measure=measure,
     context=context,
     start=start,
     option="compressed video",
@@ -194,7 +209,6 @@ SOURCE = Source(
     ),
     advice="Record without loss (raw, FFV1). If there is no choice: independently coded pictures (group 1), and a quantiser below 12.",
     reasons={
-        "measure": "the stream states the setting. Frames of kind pattern show only that blocks repeat, not how coarsely they were rounded",
         "correct": "the rounded values are lost",
         "propagate": "blocks and predictions depend on the whole picture and earlier ones; simulate sequences and locate targets in them",
     },

@@ -1,0 +1,126 @@
+"""A recorder by one scene seen directly and recorded: real coders, and a tape that plain NumPy makes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.signal import bessel
+
+from pixmetry import assess, campaign_of_arrays
+from pixmetry.assess.job import observe_campaign
+from pixmetry.budget.parameters import with_estimates
+from pixmetry.camera.catalogue import get_source
+from pixmetry.camera.group_facts import GroupFacts
+from pixmetry.core.errors import MeasureError
+from pixmetry.core.progress import no_progress
+from pixmetry.files.in_memory import Frames
+from pixmetry.series.recording import bessel_gain, group_of, recordings_of
+from pixmetry.sources.storage.video_codec import Coder, VideoCodec
+
+SHAPE, CLOCK_MHZ = (160, 224), 14.2
+ROWS, COLS = np.indices(SHAPE)
+
+
+def texture(rng: np.random.Generator) -> np.ndarray:
+    """A scene with soft steps both ways."""
+    wave = 40 * np.sin(COLS / 9 + np.sin(ROWS / 17 + rng.uniform(0, 6)))
+    return 120 + wave + 25 * (((COLS // 32) + (ROWS // 24)) % 2)
+
+
+def seen(scene: np.ndarray, count: int, rng: np.random.Generator, noise: float = 3.0) -> list[np.ndarray]:
+    return [np.clip(np.rint(scene + rng.normal(0, noise, scene.shape)), 0, 255).astype(np.uint8) for _ in range(count)]
+
+
+@pytest.mark.parametrize(("codec", "quality", "group"), [("h264", 20, 5), ("h264", 25, 7), ("h264", 22, 1)])
+def test_the_quantiser_and_the_group_of_a_coder(codec: str, quality: int, group: int, rng: np.random.Generator) -> None:
+    pytest.importorskip("av")
+    scene = texture(rng)
+    coder = Coder(VideoCodec(codec=codec, control="qp", quality=quality, group=group))
+    recorded = [coder.follow(f) for f in seen(scene, 24, rng)][2:]  # from the middle of a group on
+    fit = recordings_of(seen(scene, 12, rng), recorded).fit
+    found = fit["quality"]
+    assert abs(found.value - quality) <= 2 * found.u < 4
+    assert fit.settings["codec"] == codec
+    if group > 1:
+        assert fit["group"].value == group
+        assert fit["frame_correlation"].value > 5 * fit["frame_correlation"].u
+    else:
+        assert "does not freeze" in fit.reasons["group"]
+
+
+def test_a_lossless_coder_is_not_found(rng: np.random.Generator) -> None:
+    pytest.importorskip("av")
+    scene = texture(rng)
+    coder = Coder(VideoCodec(codec="ffv1"))
+    groups = [
+        Frames("recording", None, np.array(seen(scene, 12, rng))),
+        Frames("recording", None, np.array([coder.follow(f) for f in seen(scene, 16, rng)]), facts=GroupFacts(recorded=True)),
+    ]
+    found = observe_campaign(campaign_of_arrays(groups, bits=8, name="a camera"), no_progress)[1]
+    ratio = found.recordings.fit["noise_ratio"]
+    assert abs(ratio.value - 1) < 6 * ratio.u < 0.1  # Student's t of 15 degrees
+    with pytest.raises(MeasureError, match="loses nothing"):
+        get_source("storage.video_codec").measure(found)
+    with pytest.raises(MeasureError, match="digital"):
+        get_source("storage.tape").measure(found)
+
+
+def test_differences_to_pictures_coded_by_themselves_tell_the_group(rng: np.random.Generator) -> None:
+    squares = 0.5 + 0.05 * rng.random(40)
+    assert group_of(squares) is None
+    squares[3::6] += 4
+    assert group_of(squares) == 6
+
+
+def test_what_is_no_recording_of_the_scene_is_refused(rng: np.random.Generator) -> None:
+    scene = texture(rng)
+    with pytest.raises(MeasureError, match="8 of each"):
+        recordings_of(seen(scene, 12, rng), seen(scene, 3, rng))
+    with pytest.raises(MeasureError, match="another scene"):
+        recordings_of(seen(scene, 8, rng), seen(scene[::-1, ::-1].T[: SHAPE[0]].repeat(2, axis=1)[:, : SHAPE[1]], 8, rng))
+
+
+def test_the_gain_of_the_filter_is_that_of_scipy() -> None:
+    f = np.linspace(0.01, 0.5, 30)
+    zeros, poles, gain = bessel(3, 1.0, analog=True, output="zpk", norm="mag")
+    expected = np.abs(gain / np.prod([1j * f / 0.2 - p for p in poles], axis=0))
+    assert bessel_gain(f, 0.2) == pytest.approx(expected, rel=1e-6)
+
+
+def played(scene: np.ndarray, count: int, tape: dict[str, float], rng: np.random.Generator) -> list[np.ndarray]:
+    """Frames from a tape: rows through a Bessel filter without its delay, moved by their delays, with noise."""
+    zeros, poles, gain = bessel(3, 2 * np.pi * tape["bandwidth_mhz"], analog=True, output="zpk", norm="mag")
+    f = np.fft.rfftfreq(2 * SHAPE[1], 1 / CLOCK_MHZ)
+    s = 2j * np.pi * f
+    h = gain / np.prod([s - p for p in poles], axis=0) * np.exp(s * float(np.real(-1 / poles).sum()))
+    spectrum = np.fft.rfft(np.concatenate([scene, scene[:, ::-1]], axis=1), axis=1) * h
+    frames = []
+    for _ in range(count):
+        late_us = 1e-3 * rng.normal(0, tape["white_ns"], SHAPE[0])
+        late_us[-2 * 6 :] += 1e-3 * tape["head_switch_ns"]
+        moved = np.fft.irfft(spectrum * np.exp(-s * late_us[:, None]), 2 * SHAPE[1], axis=1)[:, : SHAPE[1]]
+        frames.append(np.clip(np.rint(moved + rng.normal(0, tape["noise_dn"], SHAPE)), 0, 255).astype(np.uint8))
+    return frames
+
+
+def test_bandwidth_time_base_and_noise_of_a_tape(rng: np.random.Generator, tmp_path) -> None:
+    """White noise in place of a tape's: its standard deviation is what is told."""
+    bars = 30 + 150.0 * (rng.random((SHAPE[0] // 8, SHAPE[1] // 4)) < 0.5).repeat(8, axis=0).repeat(4, axis=1)
+    soft = np.exp(-0.5 * (np.arange(-4, 5) / 0.6) ** 2)
+    scene = np.apply_along_axis(np.convolve, 1, np.pad(bars, ((0, 0), (4, 4)), mode="edge"), soft / soft.sum(), "valid")
+    tape = {"bandwidth_mhz": 3.0, "white_ns": 8.0, "head_switch_ns": 60.0, "noise_dn": 3.0}
+    groups = [
+        Frames("recording", None, np.array(seen(scene, 10, rng, noise=0.7))),
+        Frames("recording", None, np.array(played(scene, 16, tape, rng)), facts=GroupFacts(recorded=True)),
+    ]
+    campaign = campaign_of_arrays(groups, bits=8, name="a camera", interface="analogue", pixel_clock_mhz=CLOCK_MHZ)
+    found = assess(campaign, tmp_path / "out", trials=0)
+    told = found.estimates["storage.tape"]
+    for name, truth in tape.items():
+        u = float(np.hypot(told[name].u, 0.01 * truth))
+        assert abs(told[name].value - truth) < 6 * u < 0.6 * truth, (name, told[name])
+    assert told.settings["head_switch_rows"] == 6
+    source = get_source("storage.tape")
+    assert with_estimates(source, source.neutral, told).generations == 1
+    assert "told from the tape" in found.unmeasured["storage.video_codec"]
+    assert "The recorder" in (tmp_path / "out" / "report.html").read_text()
