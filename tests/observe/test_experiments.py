@@ -22,6 +22,7 @@ from pixmetry.observe.experiments import EXPERIMENTS
 
 STATED = {  # a lawful value of each fact
     "wavelength_nm": 850.0,
+    "focus_um": -50.0,
     "temperature_c": 40.0,
     "densities": (0.1, 0.5),
     "luminances": (80.0, 30.5),

@@ -13,6 +13,8 @@ class GroupFacts:
     ----------
     wavelength_nm : float or None
         Of the light.
+    focus_um : float or None
+        Setting of the focus of pictures of edges: how far the sensor was from the lens beyond its first place.
     temperature_c : float or None
         Of the sensor, of dark frames at another temperature than that of the campaign.
     densities : tuple of float or None
@@ -46,6 +48,7 @@ class GroupFacts:
     """
 
     wavelength_nm: float | None = None
+    focus_um: float | None = None
     temperature_c: float | None = None
     densities: tuple[float, ...] | None = None
     luminances: tuple[float, ...] | None = None

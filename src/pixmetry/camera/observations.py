@@ -344,6 +344,30 @@ class SlantedEdges:
 
 
 @dataclass(frozen=True)
+class FocusOverFrame:
+    """How far the sensor lies behind the image of a chart, all over the frame.
+
+    Parameters
+    ----------
+    settings_um : tuple of float
+        Of the focus: how far the sensor was from the lens beyond its first place.
+    places_px : ndarray, shape (edges, 2)
+        Of the edges that three settings or more show, and their directions, ``across``: as of `SlantedEdge`.
+    z_um, u_z_um : ndarray, shape (edges,)
+        Place of the sensor at the mean setting less that of the best focus, as fitted.
+    fit : Estimates
+        ``tilt_x_deg``, ``tilt_y_deg``, ``bow_x_um``, ``bow_y_um``, ``twist_um``, ``f_number``; ``reasons`` for what is not told.
+    """
+
+    settings_um: tuple[float, ...]
+    places_px: np.ndarray
+    across: tuple[str, ...]
+    z_um: np.ndarray
+    u_z_um: np.ndarray
+    fit: Estimates
+
+
+@dataclass(frozen=True)
 class Spot:
     """One bright spot: its centre, its rows and columns (first and one behind the last), and the light of its brightest pixel, DN/s."""
 
@@ -781,6 +805,7 @@ class Observations:
     outliers: SingleOutliers | None = None  # of the stack of bright frames
     code_table: CodeTable | None = None  # of companding, where the codes show one
     edges: SlantedEdges | None = None
+    focus: FocusOverFrame | None = None
     light_off: LightSteps | None = None
     spots: BrightSpots | None = None
     dark_temperatures: DarkTemperatures | None = None

@@ -40,7 +40,7 @@ TARGETS = (
 LOCATED = ("series", "motion", "views", "bands", "recording")  # kinds whose frames are measured one by one
 LOSSY = ("pattern", "speckle")  # kinds whose files may be JPEG
 FACTS = {  # what else may be said of a group, by its kind
-    "edge": ("wavelength_nm",),
+    "edge": ("wavelength_nm", "focus_um"),
     "dark": ("temperature_c",),  # which makes it the next kind
     "dark_temperature": ("temperature_c",),
     "chart": ("densities", "luminances", "u_light_rel", "regions", "white"),

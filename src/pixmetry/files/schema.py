@@ -126,6 +126,7 @@ class GroupModel(Model):
     irradiance_uw_per_cm2: Positive | None = None
     role: Literal["level", "stack"] | None = None
     wavelength_nm: Positive | None = None
+    focus_um: Annotated[float, Field(ge=-1e5, le=1e5)] | None = None
     temperature_c: Annotated[float, Field(ge=-273.15)] | None = None
     densities: Annotated[tuple[Annotated[float, Field(ge=0, le=8)], ...], Field(min_length=1)] | None = None
     luminances: Annotated[tuple[Positive, ...], Field(min_length=1)] | None = None

@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from pixmetry.camera.observations import Observations
 from pixmetry.observe.active_area import reduce_borders
 from pixmetry.observe.dark_temperature import reduce_dark_temperatures
 from pixmetry.observe.edge_fit import fit_edges
-from pixmetry.observe.edges import Picture, edge_notes, motion_notes, responses_of, search_edges
+from pixmetry.observe.edges import Picture, Search, edge_notes, motion_notes, responses_of, search_edges
 from pixmetry.observe.experiment import Experiment, PictureGroup
+from pixmetry.observe.focus import focus_of
 from pixmetry.observe.jpeg_blocks import FirstFrames, reduce_patterns
 from pixmetry.observe.laser_spots import SpotCrops, reduce_speckle
 from pixmetry.observe.lens_fit import with_other_lens
@@ -23,13 +26,17 @@ from pixmetry.observe.response_fit import response_of, with_response
 from pixmetry.observe.sequence import SequenceSums, reduce_sequences
 from pixmetry.observe.spots import reduce_spots
 
+BLUR_AT = 12  # of the frequencies of edges: 0.24 cycles/px, where their blur is compared
+
 
 def reduce_edges(groups: Sequence[PictureGroup], seen: Observations) -> Observations:
     """Find and fit the slanted edges of pictures."""
     seen = _with_wavelength(groups, seen)
     pictures = [Picture.of(g.kind, g.moments, g.bits) for g in groups]
     analogue = seen.stated.interface == "analogue"
-    search = search_edges(pictures, analogue)
+    whole = search_edges(pictures, analogue)
+    focus_um = [float("nan") if g.facts.focus_um is None else g.facts.focus_um for g in groups]
+    search, sharp = _in_focus(whole, focus_um)
     if analogue:
         line, optics = fit_line(search.measured)
         edges = responses_of(search, optics, line)
@@ -38,7 +45,23 @@ def reduce_edges(groups: Sequence[PictureGroup], seen: Observations) -> Observat
         if seen.stated.pitch_x_um == seen.stated.pitch_y_um:
             optics = with_other_lens(optics, search.measured)
         edges = responses_of(search, optics)
-    return replace(seen, edges=edges, notes=(*seen.notes, *edge_notes(edges), *motion_notes(pictures, search)))
+    if np.isfinite(focus_um).any():
+        every = responses_of(whole)
+        focus = focus_of(every.edges, every.frequency, focus_um, pictures[0].data.shape, seen.stated)
+        seen = replace(seen, focus=focus, notes=(*seen.notes, *sharp))
+    return replace(seen, edges=edges, notes=(*seen.notes, *edge_notes(edges), *motion_notes(pictures, whole)))
+
+
+def _in_focus(found: Search, focus_um: Sequence[float]) -> tuple[Search, tuple[str, ...]]:
+    """The edges of the sharpest setting of the focus, for what they have in common; those of pictures that state none too."""
+    settings = sorted({f for f in focus_um if np.isfinite(f)})
+    if len(settings) < 2:
+        return found, ()
+    blur = {f: [float(s.modulus[BLUR_AT]) for r, s in found.measured if focus_um[r.picture] == f] for f in settings}
+    best = max(settings, key=lambda f: float(np.median(blur[f])) if blur[f] else -1.0)
+    kept = tuple(one for one in found.measured if not np.isfinite(focus_um[one[0].picture]) or focus_um[one[0].picture] == best)
+    note = f"of {len(settings)} settings of the focus the sharpest, {best:g} µm, tells lens and pixel"
+    return replace(found, measured=kept), (note,)
 
 
 def _with_wavelength(groups: Sequence[PictureGroup], seen: Observations) -> Observations:

@@ -64,5 +64,8 @@ SOURCE = Source(
     references=("ISO 17957:2015 (shading)", "M. Reiss, The cos⁴ law of illumination, JOSA 35 (1945) 283–288"),
     leaves="the noise of the corners, raised with the signal",
     advice="Stop the lens down, take a lens with a longer focal length, or divide by a flat field.",
-    reasons={"measure": "a flat field shows the sum of all shading, which optics.shading measures"},
+    reasons={
+        "measure": "a flat field shows the product of all fall-off, which optics.shading measures: that of the lens and that of the "
+        "microlenses are both smooth functions of the radius, and no flat field tells which made it",
+    },
 )

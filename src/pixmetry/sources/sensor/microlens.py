@@ -49,5 +49,8 @@ SOURCE = Source(
     references=("P. B. Catrysse, B. A. Wandell, Optical efficiency of image sensor pixels, JOSA A 19 (2002) 1610–1620", "EMVA 1288 R4.0"),
     leaves="the noise of the corners, raised with the signal",
     advice="Use a lens with an exit pupil that matches the sensor. Calibrate and take flat fields at the working aperture.",
-    reasons={"measure": "a flat field shows the sum of all shading, which optics.shading measures"},
+    reasons={
+        "measure": "a flat field shows the product of all fall-off, which optics.shading measures: both this one and the lens's are smooth "
+        "functions of the radius; flat fields at two f-numbers tell what changes with the aperture, and the lens's changes too",
+    },
 )

@@ -9,9 +9,11 @@ import numpy as np
 from pixmetry.camera.contribution import Contribution, Probe
 from pixmetry.camera.geometry import frame_centre, image_shift, map_contribution
 from pixmetry.camera.light import Pull
+from pixmetry.camera.observations import Observations, of_pictures
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
 from pixmetry.core.arrays import Array
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 
 
@@ -61,6 +63,18 @@ def defocus_px2(params: Tilt, x: np.ndarray, y: np.ndarray, frame_shape: tuple[i
     return (z_um / (4 * params.f_number)) ** 2 / (params.pitch_x_um * params.pitch_y_um)
 
 
+def measure(observations: Observations) -> Estimates:
+    """From edges all over the frame at several settings of the focus. Coordinates cannot tell it: a tilted plane is seen by a homography,
+    which is a pose and a principal point."""
+    return of_pictures(
+        None if observations.focus is None else observations.focus.fit,
+        {name: name for name in ("tilt_x_deg", "tilt_y_deg", "f_number")},
+        where="sensor.tilt",
+        pictures="slanted edges all over the frame at three settings of the focus or more (focus_um)",
+        kind="edge",
+    )
+
+
 def forward(params: Tilt, signal: Signal, stream: Stream) -> Signal:
     """Look through the homography, out of focus on both sides of the axis."""
     if not (params.tilt_x_deg or params.tilt_y_deg):
@@ -103,9 +117,8 @@ SOURCE = Source(
         "T. A. Clarke, X. Wang, J. G. Fryer, The principal point and CCD cameras, Photogrammetric Record 16 (1998) 293–312",
     ),
     advice="Calibrate: principal point and principal distance include nearly all of it. Shim the sensor if one side is out of focus.",
+    measure=measure,
     reasons={
-        "measure": "coordinates cannot tell it: a tilted plane is seen by a homography, which is a pose and a principal point; "
-        "the focus over the frame would show it",
         "correct": "frames are not resampled; positions are corrected instead, by the calibration",
     },
 )

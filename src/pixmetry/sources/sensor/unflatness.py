@@ -10,7 +10,7 @@ from numpy.polynomial.legendre import legval
 from pixmetry.camera.contribution import Contribution, Probe
 from pixmetry.camera.geometry import corner_px, frame_centre, image_shift, map_contribution
 from pixmetry.camera.light import Pull
-from pixmetry.camera.observations import Observations
+from pixmetry.camera.observations import Observations, of_pictures
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
 from pixmetry.core.number import Estimates
@@ -82,7 +82,12 @@ def defocus_px2(params: Unflatness, x: np.ndarray, y: np.ndarray, frame_shape: t
 
 
 def measure(observations: Observations) -> Estimates:
-    """Bow, twist and skew by the residuals of a calibration, without what its lens and poses take up."""
+    """Bow, twist and skew by the residuals of a calibration, without what its lens and poses take up; without one, bow and twist by the
+    focus over the frame, without what is curved as the square of the radius."""
+    focus = None if observations.focus is None else observations.focus.fit
+    if observations.geometry is None and focus is not None:
+        names = ("bow_x_um", "bow_y_um", "twist_um", *(("f_number",) if "bow_x_um" in focus else ()))
+        return of_pictures(focus, {n: n for n in names}, where="sensor.unflatness", pictures="edges at several focus settings", kind="edge")
     return observations.by_residuals(where="sensor.unflatness")
 
 
