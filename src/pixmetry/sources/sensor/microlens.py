@@ -51,6 +51,6 @@ SOURCE = Source(
     advice="Use a lens with an exit pupil that matches the sensor. Calibrate and take flat fields at the working aperture.",
     reasons={
         "measure": "a flat field shows the product of all fall-off, which optics.shading measures: both this one and the lens's are smooth "
-        "functions of the radius; flat fields at two f-numbers tell what changes with the aperture, and the lens's changes too",
+        "functions of the radius; the part that changes with the f-number is no proof either, as the lens's changes with it too",
     },
 )
