@@ -13,7 +13,7 @@ from pixmetry.assess.job import observe_campaign
 from pixmetry.camera.group_facts import GroupFacts
 from pixmetry.core.errors import InputError
 from pixmetry.core.progress import no_progress
-from pixmetry.files.images import write_frame
+from pixmetry.files.images import FrameReader, write_frame
 from pixmetry.files.in_memory import Frames, campaign_of_arrays
 from pixmetry.files.manifest import load_campaign, write_manifest
 from pixmetry.files.records import FACTS, KINDS, LOCATED, TARGETS
@@ -37,15 +37,16 @@ STATED = {  # a lawful value of each fact
     "band": "LED red",
     "filtered": True,
     "refocused": True,
+    "channel": "green",
     "pulsed": True,
 }
 WITH = {
-    **{name: {"wavelength_nm": 850.0} for name in ("band", "filtered", "refocused")},
     "regions": {"densities": (0.1, 0.5)},
     "on_for_s": {"interval_s": 60.0},
     "temperatures_c": {"interval_s": 60.0},
     "pulsed": {"interval_s": 60.0},
 }  # facts that another one needs
+NEEDED = {"bands": {"wavelength_nm": 850.0}}  # by a kind
 
 
 def test_each_kind_of_the_manifest_has_its_experiment() -> None:
@@ -61,7 +62,7 @@ def test_each_fact_is_a_key_of_the_manifest_and_belongs_to_some_kind() -> None:
 
 @pytest.mark.parametrize("kind, name", [(kind, name) for kind, names in FACTS.items() for name in names])
 def test_a_fact_reaches_the_group_from_arrays_and_through_a_file(kind: str, name: str, tmp_path) -> None:
-    stated = {name: STATED[name], **WITH.get(name, {})}
+    stated = {**NEEDED.get(kind, {}), name: STATED[name], **WITH.get(name, {})}
     facts = GroupFacts(**stated)
     frames = np.arange(2 * 8 * 8, dtype=np.uint16).reshape(2, 8, 8)
     campaign = campaign_of_arrays([Frames(kind, 0.01, frames, facts=facts)], bits=8, name="a camera")
@@ -84,6 +85,19 @@ def test_a_fact_of_another_kind_is_refused() -> None:
         for kind in (k for k in (*KINDS, *TARGETS) if name not in FACTS.get(k, ())):
             with pytest.raises(InputError, match=name):
                 campaign_of_arrays([Frames(kind, 0.01, frames, facts=GroupFacts(**{name: STATED[name]}))], bits=8)
+
+
+def test_a_channel_of_colour_frames_is_measured(tmp_path, rng: np.random.Generator) -> None:
+    import imagecodecs
+
+    colour = rng.integers(0, 255, (2, 20, 24, 3)).astype(np.uint8)
+    for k, frame in enumerate(colour):
+        (tmp_path / f"{k}.png").write_bytes(imagecodecs.png_encode(frame))
+    listed = '[{kind: views, exposure_s: 0.01, channel: green, files: "*.png"}]'
+    (tmp_path / "campaign.yaml").write_text(f"schema: pixmetry/campaign/1\ncamera: {{name: one, bits: 8}}\nframes: {listed}\n")
+    campaign = load_campaign(tmp_path)
+    found = np.array([FrameReader(campaign).fetch(path) for path in campaign.groups[0].paths])
+    assert np.array_equal(found, colour[..., 1])
 
 
 def test_the_wavelength_of_edges_is_that_of_their_lens(rng: np.random.Generator) -> None:

@@ -97,6 +97,19 @@ def test_diffusion_is_told_where_the_lens_was_focused_anew(rng: np.random.Genera
     assert told["wavelength_nm"].value == 850 and "focused anew" in seen.bands.colour.reasons["scale_per_nm"]
 
 
+def test_one_large_disc_tells_the_scale_by_its_radius(rng: np.random.Generator) -> None:
+    def taken(nm: float) -> np.ndarray:
+        y, x = (np.indices((100 * 3, 110 * 3)) + 0.5) / 3 - 0.5
+        fine = np.clip((30 * (1 + 2e-5 * (nm - 550)) - np.hypot(x - 55.3 - 1e-3 * nm, y - 48.8)) * 3 + 0.5, 0, 1)
+        seen = gaussian_filter(fine, 3 * (0.6 + abs(nm - 550) / 800)).reshape(100, 3, 110, 3).mean(axis=(1, 3))
+        return np.clip(np.rint(200 + 2000 * seen + rng.normal(0, 5, (3, 100, 110))), 0, 4095).astype(np.uint16)
+
+    found = observed(*((taken(nm), nm, {}) for nm in (450.0, 550.0, 650.0, 750.0))).bands
+    told = found.colour["scale_per_nm"]
+    assert abs(told.value - 2e-5) < Z * told.u and told.u < 2e-6
+    assert found.shift_x_px[3] - found.shift_x_px[0] == pytest.approx(0.3, abs=0.02)
+
+
 def test_what_bands_cannot_tell_has_a_reason(rng: np.random.Generator) -> None:
     seen = observed((frames_of(rng), 530.0, {}), (rng.integers(190, 210, (2, *SHAPE)).astype(np.uint16), 850.0, {}))
     assert "1 of 2 bands" in seen.failed["bands"] and "1 of 2 bands" in measure_sources(seen)[1]["optics.lateral_colour"]

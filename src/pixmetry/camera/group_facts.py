@@ -45,6 +45,8 @@ class GroupFacts:
         Whether a filter was in front of the lens or the sensor.
     refocused : bool or None
         Whether the lens was focused anew for this band.
+    channel : str or None
+        ``"red"``, ``"green"`` or ``"blue"``: the one of colour images to measure in.
     """
 
     wavelength_nm: float | None = None
@@ -64,3 +66,4 @@ class GroupFacts:
     band: str | None = None
     filtered: bool | None = None
     refocused: bool | None = None
+    channel: str | None = None

@@ -60,27 +60,36 @@ def read_frame(path: str | Path) -> np.ndarray:
     return load_frame(Path(path)).array
 
 
-def load_frame(path: Path, plain_png: PlainPng | None = None, raw: RawLayout | None = None, *, lossy: bool = False) -> LoadedFrame:
+def load_frame(
+    path: Path, plain_png: PlainPng | None = None, raw: RawLayout | None = None, *, lossy: bool = False, channel: str | None = None
+) -> LoadedFrame:
     """Read one frame and the SHA-256 of its file from the same bytes; errors as in `read_frame`.
 
     Of a frame in a store or in a file with several, the digest is that of its values. With ``lossy`` JPEG files are taken too: their
-    luminance.
+    luminance. With ``channel`` colour images are taken too: that channel.
     """
     if is_entry(path):
         array, sha256, size = read_entry(path)
         return LoadedFrame(_checked(array, path), sha256, size, lossless_store(path))
     if is_frame(path) or raw_file(path, raw):
         found, sha256, size = read_stacked(path if is_frame(path) else path / "0", raw)
-        return LoadedFrame(_checked(found.array, path), sha256, size, found.lossless)
+        return LoadedFrame(_checked(_channel_of(found.array, channel), path), sha256, size, found.lossless)
     data = _read_bytes(path)
     sha256 = hashlib.sha256(data).hexdigest()
     if plain_png is not None and data.startswith(SIGNATURE) and (png := plain_png.decode(data)) is not None:
         return LoadedFrame(png, sha256, len(data))
     found = decode(data, path, lossy=lossy)
     if lossy and data.startswith(JPEG) and found.lossless is False:
-        array = found.array if found.array.ndim == 2 else luminance_of(data)
+        array = _channel_of(found.array, channel)
+        array = array if array.ndim == 2 else luminance_of(data)
         return LoadedFrame(_checked(array, path), sha256, len(data), False, luminance_table(data))
-    return LoadedFrame(_checked(found.array, path), sha256, len(data), found.lossless)
+    return LoadedFrame(_checked(_channel_of(found.array, channel), path), sha256, len(data), found.lossless)
+
+
+def _channel_of(array: np.ndarray, channel: str | None) -> np.ndarray:
+    """One channel of a colour image; a grey one, and where no channel is named, the image as it is."""
+    colour = channel is not None and array.ndim == 3 and array.shape[2] in (3, 4)
+    return array[:, :, CHANNELS[channel]] if colour and channel is not None else array
 
 
 def read_picture(path: str | Path, channel: str | None = None, raw: RawLayout | None = None) -> np.ndarray:
@@ -289,6 +298,7 @@ class FrameReader:
         self._plain_png = PlainPng()
         self._coders: set[bool | None] = set()
         self._patterns = {path for group in campaign.groups if group.kind in LOSSY for path in group.paths}
+        self._channels = {path: group.facts.channel for group in campaign.groups for path in group.paths}
         self._tables: set[tuple[int, ...]] = set()
         for listing in (campaign.source_path, campaign.descriptor_path):
             if campaign.arrays is None and listing is not None and listing.is_file():
@@ -315,7 +325,7 @@ class FrameReader:
             if path not in self._patterns:
                 self._coders.add(None)
             return array
-        frame = load_frame(path, self._plain_png, c.raw, lossy=path in self._patterns)
+        frame = load_frame(path, self._plain_png, c.raw, lossy=path in self._patterns, channel=self._channels.get(path))
         check_frame(frame.array, str(path), bits=c.bits, shape=c.stored_shape, dtype=c.frame_dtype)
         self.hashes.add(path, frame.sha256, frame.size_bytes)
         if path in self._patterns:  # they show a coder; how the others were stored is another question

@@ -78,7 +78,7 @@ def load_campaign(path: str | Path | None = None) -> Campaign:
         facts["raw"] = None if model.raw is None else RawLayout(**model.raw.model_dump())
         parts = _from_manifest(source, model, lines, facts["raw"])
     groups, findings = check_groups(parts["groups"], str(source))
-    stored, dtype = _discover(groups[0].paths[0], parts, facts.get("raw"), lossy=groups[0].kind in LOSSY)
+    stored, dtype = _discover(groups[0].paths[0], parts, facts.get("raw"), of=groups[0])
     shape = active_shape(parts["camera"], stored, str(source))
     check_window(parts["camera"], shape, str(source))
     return Campaign(
@@ -94,9 +94,9 @@ def load_campaign(path: str | Path | None = None) -> Campaign:
     )
 
 
-def _discover(path: Path, parts: Mapping[str, Any], raw: RawLayout | None, *, lossy: bool) -> tuple[tuple[int, int], str]:
+def _discover(path: Path, parts: Mapping[str, Any], raw: RawLayout | None, *, of: FrameGroup) -> tuple[tuple[int, int], str]:
     """Take size and depth from the first frame; the size must be the declared one where one was declared."""
-    array = load_frame(path, raw=raw, lossy=lossy).array
+    array = load_frame(path, raw=raw, lossy=of.kind in LOSSY, channel=of.facts.channel).array
     check_frame(array, str(path), bits=parts["camera"].bits, shape=parts.get("shape"))
     return (array.shape[0], array.shape[1]), array.dtype.name
 

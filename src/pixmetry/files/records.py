@@ -47,8 +47,9 @@ FACTS = {  # what else may be said of a group, by its kind
     "line": ("recorded",),
     "series": ("times_s", "interval_s", "on_for_s", "temperatures_c"),
     "motion": ("times_s", "interval_s", "pulsed"),
-    "speckle": ("wavelength_nm",),
-    "bands": ("wavelength_nm", "band", "filtered", "refocused"),
+    "speckle": ("wavelength_nm", "channel"),
+    "views": ("channel",),
+    "bands": ("wavelength_nm", "band", "filtered", "refocused", "channel"),
     "sequence": ("times_s", "interval_s"),
     "recording": ("recorded",),
 }

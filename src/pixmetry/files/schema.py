@@ -142,6 +142,7 @@ class GroupModel(Model):
     band: Text | None = None
     filtered: bool | None = None
     refocused: bool | None = None
+    channel: Literal["red", "green", "blue"] | None = None
     files: Names
 
     @model_validator(mode="before")

@@ -31,7 +31,8 @@ SIGNIFICANT, MISFIT = 3.0, 2.0
 SIDE_PX, FINE = 48, 4  # of the picture of a disc with diffusion, and its points along a pixel
 LENGTHS_UM = np.array([0.0, 2.0, 4.0, 7.0, 12.0, 20.0, 35.0, 60.0, 100.0])
 MODEL_U = 0.1  # relative, of the blur that a diffusion length makes, by the depth of the depleted layer and the shape of the template
-COLOUR = "scale of the field of matched targets over the wavelength, weighted straight line"
+RADIUS_U_PX = 0.005  # of a fitted disc, whose edge a response that bends moves by as much as it is blurred
+COLOUR = "scale of the field of matched targets, or radius of one or two discs, over the wavelength; weighted straight line"
 DEEPER = "light with a filter over that without it, at each wavelength; blur of the targets"
 BLURRED = "blur of the targets in the infrared against that of visible light; a disc with diffusion is measured in the same way"
 MOVED = "a lens that is focused anew, or targets that come nearer, between two bands scale the image as lateral colour does"
@@ -159,9 +160,18 @@ def _scales(shown: Sequence[Band], frame_shape: tuple[int, int]) -> tuple[Array,
     centre = 0.5 * (frame_shape[1] - 1), 0.5 * (frame_shape[0] - 1)
     try:
         places, covariance = follow_targets(frames)
-        motion = field_motion(places, covariance, centre)
     except MeasureError as problem:
         return *nothing, str(problem.what)
+    try:
+        motion = field_motion(places, covariance, centre)
+    except MeasureError as problem:  # one or two discs: their own size
+        moved = np.nanmean(places - np.nanmean(places, axis=0), axis=1)
+        shift = np.array([np.nanmean(moved[of == k], axis=0) for k in range(count)])
+        radius, u_radius = _means([b.radius for b in shown])
+        if not np.isfinite(radius + u_radius).all():
+            return shift, *nothing[1:], str(problem.what)
+        whole = float(radius.mean())
+        return shift, radius / whole - 1, np.hypot(u_radius, RADIUS_U_PX) / whole, ""
     at = [motion.modes.index(m) for m in ("shift_x_px", "shift_y_px", "scale_rel")]
     shift, scale, u = nothing
     for k in range(count):
