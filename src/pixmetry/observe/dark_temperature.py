@@ -13,6 +13,7 @@ from pixmetry.core.arrays import Array
 from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.number import Estimates
 from pixmetry.observe.experiment import PictureGroup
+from pixmetry.observe.photon_transfer_model import rounding_error_vars
 
 BOLTZMANN_EV_PER_K = 8.617333262e-5  # CODATA 2018
 ZERO_C_K = 273.15
@@ -191,6 +192,7 @@ def reduce_dark_temperatures(groups: Sequence[PictureGroup], seen: Observations)
     notes: list[str] = []
     currents = []
     by_temperature: dict[float, list[PictureGroup]] = {}
+    usable: dict[float, list[PictureGroup]] = {}
     for group in groups:
         if group.facts.temperature_c is not None and group.moments.n_frames < 2:
             which = f"{group.facts.temperature_c:g} °C, exposure {group.exposure_s:g} s"
@@ -207,17 +209,17 @@ def reduce_dark_temperatures(groups: Sequence[PictureGroup], seen: Observations)
         if any(g.moments.counts[0] > CLIPPED * g.moments.counts.sum() for g in own):
             notes.append(f"dark frames at {temperature:g} °C are left out: they are clipped at code 0; raise the black level")
             continue
-        times = np.array([g.exposure_s for g in own])
-        means = [g.moments.frame_means_dn() for g in own]
-        levels = np.array([m.mean() for m in means])
-        scatter = float(np.sqrt(np.mean([m.var(ddof=1) for m in means])))
-        floor = np.sqrt([(g.moments.deviation_map_dn2().mean() / (g.moments.n_frames - 1) + 1 / 12) / levels.size for g in own])
-        u = np.hypot(scatter, floor / np.sqrt(own[0].moments.shape[0] * own[0].moments.shape[1])) / np.sqrt([m.size for m in means])
-        slope = _slope(times, levels, u)
+        usable[temperature] = own
+    wander2 = _wander2([g for own in usable.values() for g in own])
+    dnl = 0.0 if seen.code_errors is None or "dnl_rms_lsb" not in seen.code_errors.fit else seen.code_errors.fit["dnl_rms_lsb"].value
+    for temperature, own in usable.items():
+        levels = np.array([g.moments.frame_means_dn().mean() for g in own])
+        slope = _slope(np.array([g.exposure_s for g in own]), levels, np.array([_u_level(g, wander2, dnl) for g in own]))
         if slope is None:
             notes.append(f"dark frames at {temperature:g} °C are left out: one exposure time; take a second one, many times as long")
         else:
-            currents.append((temperature, *slope))
+            rate, u = slope
+            currents.append((temperature, rate, float(np.hypot(u, rate * _bend_rel(seen, float(np.ptp(levels)), own[0].bits)))))
     if seen.photon_transfer is not None and seen.temperature_c is not None and seen.photon_transfer.dark.mean_dn.size:
         dark = seen.photon_transfer.dark
         slope = _slope(dark.exposure_s, dark.mean_dn, np.sqrt(np.maximum(dark.ms_frame_dn2, 1e-12).mean() / dark.n_frames))
@@ -233,6 +235,36 @@ def reduce_dark_temperatures(groups: Sequence[PictureGroup], seen: Observations)
         fit = replace(Estimates.empty(), reasons={"doubling_temperature_k": "; to do: ".join(filter(None, (why, problem.remedy)))})
     found = DarkTemperatures(table[:, 0], table[:, 1], table[:, 2], reference, fit)
     return replace(seen, dark_temperatures=found, notes=(*seen.notes, *notes))
+
+
+def _bend_rel(seen: Observations, signal_dn: float, bits: int) -> float:
+    """What the response may add to a dark signal: as fitted to the light levels; else in proportion to the signal, as behind a bend."""
+    known = seen.photon_transfer_fit is not None and "nonlinearity_a1" in seen.photon_transfer_fit
+    return seen.bend_rel(signal_dn) * (1.0 if known else signal_dn / (2.0**bits - 1))
+
+
+def _white2(group: PictureGroup) -> float:
+    """Variance of the mean of a frame by the noise of its pixels, DN²."""
+    moments = group.moments
+    return float(moments.deviation_map_dn2().mean(dtype=float)) / (moments.n_frames - 1) / (moments.shape[0] * moments.shape[1])
+
+
+def _wander2(groups: Sequence[PictureGroup]) -> float:
+    """Variance of the means of frames beyond that of their pixels, over all groups, DN²."""
+    if not groups:
+        return 0.0
+    dof = np.array([g.moments.n_frames - 1.0 for g in groups])
+    beyond = [g.moments.frame_means_dn().var(ddof=1) - _white2(g) for g in groups]
+    return max(float(np.average(beyond, weights=dof)), 0.0)
+
+
+def _u_level(group: PictureGroup, wander2: float, dnl_lsb: float) -> float:
+    """Standard uncertainty of the mean of a group: wander and pixels of its frames, and the converter's steps."""
+    n, pixels = group.moments.n_frames, group.moments.shape[0] * group.moments.shape[1]
+    white2 = _white2(group)
+    spread = float(group.moments.mean_map_dn().var())
+    steps = float(rounding_error_vars(np.array(white2 * pixels), spread, dnl_lsb)[0])
+    return float(np.sqrt((wander2 + white2) / n + steps))
 
 
 def _slope(times: np.ndarray, levels: np.ndarray, u: np.ndarray) -> tuple[float, float] | None:
