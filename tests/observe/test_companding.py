@@ -69,6 +69,7 @@ def test_steps_that_hide_the_noise_are_refused(rng):
 
 
 def test_all_codes_occur_without_a_table(rng):
+    """Each of many codes would have to be missing where 20 or more are due: less than e⁻²⁰ by chance."""
     seen = seen_behind(rng, lambda codes, bits: codes, 12)
     assert seen.code_table is None
     assert "not found" in measure_sources(seen)[1]["processing.companding"]

@@ -86,7 +86,9 @@ def test_luminance_tells_no_gain(rng):
 
 
 def test_raw_mosaic_is_no_demosaicking(rng):
-    """The colours' different light gives the variance a period of two pixels too, as it gives it to the mean."""
+    """The colours' different light gives the variance a period of two pixels too, as it gives it to the mean. Noise would have to
+    differ by 8 u to be taken for a demosaicking.
+    """
     seen = campaign(rng, lambda codes: codes, "RGGB")
     assert "not found" in measure_sources(seen)[1]["processing.demosaic"]
     gain = seen.photon_transfer_fit["gain_dn_per_e"]
