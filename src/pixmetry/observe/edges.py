@@ -39,6 +39,9 @@ MOST_ORDER, F_LEVEL = 5, 1e-3
 PHASES, PHASE_SHARE = 6, 0.05  # of the rows in each sixth of a pixel
 NEIGHBOUR_SHARE = 0.03  # of the rows with another step, from which on it is another edge
 TILE_ROWS = 256
+LIGHT_TERMS, LIGHT_U = ("x", "y", "xx", "xy", "yy"), 0.2  # of the light over a picture; how large each is before anything is measured
+FAR_PX = 3.0  # from the edge, from which on pixels tell the light
+UNEVEN_CHI2, LEAST_LIGHT = 40.0, 0.3  # from which on a picture is divided by its light; and its least part of that of the middle
 STEP_SIGMAS, LEAST_STEP_DN, LEAST_STEP_REL = 8.0, 2.0, 0.02  # of noise; absolute; of the range of values
 # u of an asymmetry that comes of the bins of 1/4 px, over the width of the edge from 10 to 90 % in px: a × exp(−b × width). Of symmetric
 # edges without noise behind Gaussians of 0.2, 0.4, 0.7 and 1.0 px the scatter over places and angles is .014, .0052, .0010 and .0002.
@@ -157,15 +160,71 @@ def search_edges(pictures: Sequence[Picture], analogue: bool = False) -> Search:
     measured: list[tuple[Region, Spread]] = []
     refused: list[RefusedEdge] = []
     for number, picture in enumerate(pictures):
-        for across in ("x", "y"):
-            frame = picture.data if across == "x" else np.ascontiguousarray(picture.data.T)
-            chains = step_chains(frame)
-            for result in map_tiles(partial(_measured, frame, picture, number, across, chains, analogue), chains.long):
-                if isinstance(result, RefusedEdge):
-                    refused.append(result)
-                else:
-                    measured.append(result)
+        found = _edges_in(picture, number, analogue)
+        even = _in_even_light(picture, found.measured)
+        if even is not picture:
+            found = _edges_in(even, number, analogue)
+        measured += found.measured
+        refused += found.refused
     return Search(tuple(measured), tuple(refused))
+
+
+def _edges_in(picture: Picture, number: int, analogue: bool) -> Search:
+    """The edges of one picture."""
+    measured: list[tuple[Region, Spread]] = []
+    refused: list[RefusedEdge] = []
+    for across in ("x", "y"):
+        frame = picture.data if across == "x" else np.ascontiguousarray(picture.data.T)
+        chains = step_chains(frame)
+        for result in map_tiles(partial(_measured, frame, picture, number, across, chains, analogue), chains.long):
+            if isinstance(result, RefusedEdge):
+                refused.append(result)
+            else:
+                measured.append(result)
+    return Search(tuple(measured), tuple(refused))
+
+
+def _in_even_light(picture: Picture, measured: Sequence[tuple[Region, Spread]]) -> Picture:
+    """The picture over the slow part of its light, a polynomial of second order; itself where the edges show none.
+
+    Only how the light changes along the edges counts, at each distance from them: across an edge, the lens spreads light too. So the
+    slope along x is that of the edges along x, and without such edges it is left alone.
+    """
+    normal, right = np.eye(len(LIGHT_TERMS)) / LIGHT_U**2, np.zeros(len(LIGHT_TERMS))
+    centre, half = _centre_of(picture.data.shape)
+    for region, spread in measured:
+        residual, distance = residuals_of(region, spread.value_dn)
+        value, _ = pixels_of(region)
+        known = np.isfinite(residual) & (np.abs(distance) > FAR_PX)
+        level = np.where(known, value - residual, 1.0)
+        row = np.broadcast_to(region.first + np.arange(region.rows)[:, None], value.shape)
+        col = distance / region.cosine + region.centre[:, None]
+        x, y = (col, row) if region.across == "x" else (row, col)
+        terms = _light_terms((x - centre[0]) / half, (y - centre[1]) / half)
+        count = np.maximum(known.sum(axis=0), 1)
+        terms = (terms - np.where(known, terms, 0.0).sum(axis=1, keepdims=True) / count) * known
+        weight = np.where(known, level, 0.0) ** 2 / spread.noise_dn**2 / (1 + 2 * max(spread.along_rel, 0.0))
+        normal += np.einsum("irc,jrc,rc->ij", terms, terms, weight)
+        right += np.einsum("irc,rc->i", terms, weight * np.where(known, residual, 0.0) / level)
+    found = np.linalg.solve(normal, right)
+    if float(right @ found) < UNEVEN_CHI2:
+        return picture
+    x, y = ((np.arange(n) - middle) / half for n, middle in zip(picture.data.shape[::-1], centre, strict=True))
+    light = 1 + np.tensordot(found, _light_terms(*np.meshgrid(x, y)), 1)
+    if light.min() < LEAST_LIGHT:
+        return picture
+    return replace(picture, data=(picture.data / light).astype(np.float32))
+
+
+def _centre_of(shape: tuple[int, int]) -> tuple[tuple[float, float], float]:
+    """The middle of a frame (x, y), and half of its longer side."""
+    rows, cols = shape
+    return (0.5 * (cols - 1), 0.5 * (rows - 1)), 0.5 * max(rows, cols)
+
+
+def _light_terms(x: Array, y: Array) -> Array:
+    """x, y, x², xy, y², shape (5, …)."""
+    return np.stack([x, y, x * x, x * y, y * y])
 
 
 def motion_notes(pictures: Sequence[Picture], found: Search) -> list[str]:
