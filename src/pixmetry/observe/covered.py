@@ -119,7 +119,7 @@ def covered_pixels(
     limits: set[str] = set()
     reasons: dict[str, str] = {}
     trails = []
-    below = [g for g in flat if max(float(_light(g, zero, axis, covered).max()) for axis in AXES) < MOST_FULL * saturation_dn]
+    below = _not_full(flat, zero, covered, saturation_dn)
     for names, (axis, (depth, before)) in zip((SERIAL, PARALLEL), _depths(covered).items(), strict=True):
         trail = _trail(below, zero, depth, before, axis, gain_dn_per_e)
         if isinstance(trail, str):
@@ -194,6 +194,21 @@ def _light(group: BorderFrames, zero: _Zero, axis: str, covered: Covered) -> Arr
     after, before = _depths(covered)[axis]
     profile = np.mean([getattr(frame, axis) for frame in group.in_order()], axis=0) - zero.along(axis)
     return np.asarray(profile[before : len(profile) - after], float)
+
+
+def _not_full(flat: Sequence[BorderFrames], zero: _Zero, covered: Covered, saturation_dn: float) -> list[BorderFrames]:
+    """The bright frames below saturation: full pixels spill charge under the cover.
+
+    Where the light grows by the exposure, a level from which it grows less than before, by a tenth, is full, and so are all above it.
+    """
+    kept = [g for g in flat if max(float(_light(g, zero, axis, covered).max()) for axis in AXES) < MOST_FULL * saturation_dn]
+    kept.sort(key=lambda g: g.exposure_s)
+    time = np.array([g.exposure_s for g in kept])
+    if len(kept) < 4 or not (np.diff(time) > 0).all():
+        return kept
+    growth = np.diff([float(_light(g, zero, "rows", covered).mean()) for g in kept]) / np.diff(time)
+    slower = np.flatnonzero(growth < MOST_FULL * np.median(growth))
+    return kept if not len(slower) else kept[: int(slower[0]) + 1]
 
 
 def _leak(profiles: Array, before: int) -> Array:

@@ -42,8 +42,9 @@ from pixmetry.observe.photon_transfer_model import MINIMUM_DARK_VAR_DN2, QUANTIS
 MOST_CLIPPED = 0.002  # share of the pixels at the ends of the codes
 LITTLE_MORE, FALLEN = 1.15, 0.75  # of light and variance from level to level: so much less where pixels are full
 FOUND_Z, FOUND_PATTERN_Z = 4.2, 3.5  # of one of the twelve near lags; of the pattern of repelled charge: false in 1e-3 of cameras
-PRESENT = 0.02  # chance, before anything is measured, that a camera has a filter, repelled charge, or temporal noise reduction
-LARGEST_SHARE, LARGEST_LOSS, LARGEST_ALPHA = 0.2, 0.1, 0.9  # if there: all sizes up to this are equally likely
+PRESENT = 0.02  # chance, before anything is measured, that a camera has a filter or temporal noise reduction
+REPELLED = 0.25  # the same of repelled charge that can be seen: every sensor has some
+LARGEST_SHARE, LARGEST_LOSS, LARGEST_ALPHA = 0.2, 0.03, 0.9  # if there: all sizes up to this are equally likely
 FIT_LEVEL = 1e-4  # chance of a worse fit below which a family is refused
 NEAR = tuple(k for k, (j, i) in enumerate(LAGS) if 0 < max(abs(j), abs(i)) <= 2)
 SHARPENING, BLUR, KERNEL, LINE, LOSS = (
@@ -345,12 +346,12 @@ def _largest_z(part: _ShotPart) -> tuple[float, float]:
     share = 2 * float(part.constant[beside].sum())
     u_share = 2 * float(np.sqrt(part.constant_covariance[np.ix_(beside, beside)].sum()))
     mean = float((part.shot_dn2**2).sum() / part.shot_dn2.sum() / largest)
-    unseen = [unseen_rms(loss, root, LARGEST_LOSS) * mean for loss, root in zip(losses, power**-0.5, strict=True)]
+    unseen = [unseen_rms(loss, root, LARGEST_LOSS, present=REPELLED) * mean for loss, root in zip(losses, power**-0.5, strict=True)]
     doubt = max(*unseen, unseen_rms(share, u_share, LARGEST_SHARE, both_signs=True))
     return max(float(single.max()) / FOUND_Z, float(together.max()) / FOUND_PATTERN_Z), doubt
 
 
-def unseen_rms(estimate: float, u: float, largest: float, *, both_signs: bool = False) -> float:
+def unseen_rms(estimate: float, u: float, largest: float, *, both_signs: bool = False, present: float = PRESENT) -> float:
     """Root mean square of an effect that does not stand out of its uncertainty.
 
     Parameters
@@ -361,10 +362,12 @@ def unseen_rms(estimate: float, u: float, largest: float, *, both_signs: bool = 
         If it is there, all sizes up to this are equally likely, before anything is measured.
     both_signs : bool
         Whether it may be negative.
+    present : float
+        Chance, before anything is measured, that it is there.
 
     Notes
     -----
-    With the chance `PRESENT` that the effect is there, and the likelihoods of the estimate with and without it, Bayes' rule gives the
+    With the chance ``present`` that the effect is there, and the likelihoods of the estimate with and without it, Bayes' rule gives the
     chance P of it; the root mean square is √(P ⟨x²⟩) over the posterior of its size x. An estimate of zero leaves next to nothing, one of
     two u a part, and one of four u all of it: what one camera in fifty has is not taken for what every one has.
 
@@ -377,7 +380,7 @@ def unseen_rms(estimate: float, u: float, largest: float, *, both_signs: bool = 
     x = np.linspace(max(low, estimate - 8 * u), max(min(largest, estimate + 8 * u), low), 801)
     likely = np.exp(-0.5 * ((x - estimate) / u) ** 2)
     step = x[1] - x[0]
-    odds = PRESENT / (1 - PRESENT) * float(likely.sum()) * step / (largest - low) / max(float(np.exp(-0.5 * (estimate / u) ** 2)), 1e-300)
+    odds = present / (1 - present) * float(likely.sum()) * step / (largest - low) / max(float(np.exp(-0.5 * (estimate / u) ** 2)), 1e-300)
     square = float((likely * x**2).sum() / max(float(likely.sum()), 1e-300))
     return float(np.sqrt(odds / (1 + odds) * square))
 

@@ -117,6 +117,9 @@ def measure(observations: Observations) -> Estimates:
     if not found:
         raise reasons[1] if observations.covered is None or spots is not None else reasons[0]
     best, seen = min(found, key=lambda fit: fit["transfer_s"].u), observations.spots
+    if not best.limits and observations.photon_transfer is not None:  # faint charge over much light: a bent response changes their ratio
+        bend = best.values * observations.bend_rel(0.5 * 2.0**observations.photon_transfer.bits)
+        best = replace(best, covariance=best.covariance + np.outer(bend, bend))
     if seen is None or "smear_s" not in seen.fit or seen.fit["smear_s"].is_limit:
         return best
     return replace(best, settings={"rows": seen.smear_rows, "store": seen.smear_store})  # whatever told the amount
