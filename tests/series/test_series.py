@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from PIL import Image
 from tests.series.fixed_field import rendered
 
 from pixmetry import assess, campaign_of_arrays, series
@@ -191,3 +192,14 @@ def test_a_series_that_fails_says_why_at_its_sources(rng: np.random.Generator) -
     )
     for source in ("sensor.mount_drift", "sensor.rolling_shutter"):
         assert "not told by" in found.unmeasured[source] and "take frames" not in found.unmeasured[source]
+
+
+def test_frames_of_a_film_may_be_jpeg(rng: np.random.Generator, tmp_path: Path) -> None:
+    for k in range(12):
+        Image.fromarray(frame(k, rng)).save(tmp_path / f"{k:02d}.jpg", quality=92)
+    (tmp_path / "campaign.yaml").write_text(
+        "schema: pixmetry/campaign/1\ncamera: {name: a film, bits: 8}\nframes:\n- {kind: series, interval_s: 120, files: '*.jpg'}\n"
+    )
+    found = assess(tmp_path / "campaign.yaml", trials=0)
+    assert any("kind series are JPEG" in note for note in found.observations.notes)
+    assert "sensor.mount_drift" in found.estimates or "series" in found.unmeasured["sensor.mount_drift"]

@@ -326,7 +326,8 @@ def observe_campaign(campaign: Campaign, progress: Progress) -> tuple[InputHashe
     known = fit is not None and {"saturation_dn", "offset_dn"} <= set(fit.names)
     full = fit["saturation_dn"].value - fit["offset_dn"].value if fit is not None and known else float("inf")
     bordered = covered_pixels(borders, campaign.camera.interface == "analogue", gain, full)
-    notes = (*campaign.findings, *left_out, *seen.notes, *(() if bordered is None else bordered.notes))
+    coded = [f"frames of kind {kind} are JPEG: their positions hold what the coder does" for kind in sorted(reader.located_with_loss)]
+    notes = (*campaign.findings, *left_out, *seen.notes, *coded, *(() if bordered is None else bordered.notes))
     facts = campaign.camera
     return reader.hashes, replace(seen, storage=reader.storage, sensor=facts.sensor, covered=bordered, notes=notes)
 

@@ -19,7 +19,7 @@ from pixmetry.files.jpeg import luminance_of, luminance_table
 from pixmetry.files.png import SIGNATURE, PlainPng
 from pixmetry.files.provenance import InputHashes
 from pixmetry.files.raw_values import RawLayout
-from pixmetry.files.records import LOSSY, Campaign, FrameGroup
+from pixmetry.files.records import LOCATED, LOSSY, Campaign, FrameGroup
 from pixmetry.files.zarr_frames import entries, is_entry, lossless_store, read_entry
 
 CHANNELS = {"red": 0, "green": 1, "blue": 2}
@@ -297,8 +297,9 @@ class FrameReader:
         self.hashes = InputHashes(campaign.base)
         self._plain_png = PlainPng()
         self._coders: set[bool | None] = set()
-        self._patterns = {path for group in campaign.groups if group.kind in LOSSY for path in group.paths}
         self._channels = {path: group.facts.channel for group in campaign.groups for path in group.paths}
+        self._patterns = {path: group.kind for group in campaign.groups if group.kind in LOSSY for path in group.paths}
+        self.located_with_loss: set[str] = set()  # kinds whose positions are those of a lossy coder
         self._tables: set[tuple[int, ...]] = set()
         for listing in (campaign.source_path, campaign.descriptor_path):
             if campaign.arrays is None and listing is not None and listing.is_file():
@@ -331,6 +332,8 @@ class FrameReader:
         if path in self._patterns:  # they show a coder; how the others were stored is another question
             if frame.table is not None:
                 self._tables.add(frame.table)
+                if self._patterns[path] in LOCATED:
+                    self.located_with_loss.add(self._patterns[path])
             return frame.array
         self._coders.add(frame.lossless)
         if frame.lossless is False and c.camera.lossless:

@@ -38,7 +38,7 @@ TARGETS = (
     "recording",
 )  # pictures of something to measure; one frame may be enough
 LOCATED = ("series", "motion", "views", "bands", "recording")  # kinds whose frames are measured one by one
-LOSSY = ("pattern", "speckle")  # kinds whose files may be JPEG
+LOSSY = ("pattern", "speckle", *LOCATED)  # kinds whose files may be JPEG
 FACTS = {  # what else may be said of a group, by its kind
     "edge": ("wavelength_nm", "focus_um"),
     "dark": ("temperature_c",),  # which makes it the next kind
