@@ -30,6 +30,8 @@ INFRARED_NM = 700.0  # light above which is absorbed so deep that its charge dif
 SIGNIFICANT, MISFIT = 3.0, 2.0
 SIDE_PX, FINE = 48, 4  # of the picture of a disc with diffusion, and its points along a pixel
 LENGTHS_UM = np.array([0.0, 2.0, 4.0, 7.0, 12.0, 20.0, 35.0, 60.0, 100.0])
+LAMP_U = 0.003  # relative, of the light of a lamp from one band to the next, and of an exposure
+PLATE_U = 0.1  # relative, of the variance of a defocused disc, which is no Gaussian blur
 MODEL_U = 0.1  # relative, of the blur that a diffusion length makes, by the depth of the depleted layer and the shape of the template
 RADIUS_U_PX = 0.005  # of a fitted disc, whose edge a response that bends moves by as much as it is blurred
 COLOUR = "scale of the field of matched targets, or radius of one or two discs, over the wavelength; weighted straight line"
@@ -221,7 +223,7 @@ def _through(nm: Array, filtered: np.ndarray, level: Array, u: Array) -> Array:
     for k in np.flatnonzero(filtered & np.isfinite(level)):
         for j in np.flatnonzero(~filtered & (np.abs(nm - nm[k]) < 0.5) & np.isfinite(level)):
             value = level[k] / level[j]
-            rows.append((nm[k], value, value * np.hypot(u[k] / level[k], u[j] / level[j])))
+            rows.append((nm[k], value, value * np.sqrt((u[k] / level[k]) ** 2 + (u[j] / level[j]) ** 2 + 2 * LAMP_U**2)))
     return np.array(rows).reshape(-1, 3).T
 
 
@@ -265,7 +267,7 @@ def _plate(nm: Array, filtered: np.ndarray, blur: Array, u: Array, stated: State
         row = ("plate_um", limit, to_um**2 * u_more / (2 * limit), np.inf, "µm")
         why = {"plate_um": "the filter does not blur the image; 95 % upper limit, without the filter in sharpest focus"}
         return Estimates.from_rows([row, *known], method=DEEPER, limits=frozenset({"plate_um"}), reasons=why)
-    value = to_um * float(np.sqrt(more))
+    value, u_more = to_um * float(np.sqrt(more)), float(np.hypot(u_more, PLATE_U * more))
     why = {"plate_um": "for the lens in sharpest focus without the filter, and an index of 1.52"}
     return Estimates.from_rows([("plate_um", value, to_um**2 * u_more / (2 * value), np.inf, "µm"), *known], method=DEEPER, reasons=why)
 

@@ -8,7 +8,7 @@ from pixmetry.camera.colour_bands import ColourBands
 from pixmetry.core.number import Number
 from pixmetry.report import Column, Section, Table
 from pixmetry.report.drawing import BLUE, RED, canvas
-from pixmetry.report.numbers import significant
+from pixmetry.report.numbers import significant, uncertain
 from pixmetry.report.page import Figure
 
 TITLES = {
@@ -48,7 +48,7 @@ def summary_sentence(found: ColourBands) -> str:
     text = f"Targets in {len(found.wavelength_nm)} bands from {found.wavelength_nm.min():g} to {found.wavelength_nm.max():g} nm. "
     if "scale_per_nm" in found.colour:
         slope = found.colour["scale_per_nm"]
-        return text + f"The scale of the image changes by ({1e9 * slope.value:.3g} ± {1e9 * slope.u:.2g}) ppb per nm."
+        return text + f"The scale of the image changes by {uncertain(1e9 * slope.value, 1e9 * slope.u, 'ppb per nm').joined()}."
     return text + f"Lateral colour is not told: {found.colour.reasons['scale_per_nm']}."
 
 

@@ -8,7 +8,7 @@ from pixmetry.camera.views import TargetViews
 from pixmetry.core.number import Number
 from pixmetry.report import Column, Section, Table
 from pixmetry.report.drawing import BLUE, INK, RED, SOFT, canvas, line
-from pixmetry.report.numbers import significant
+from pixmetry.report.numbers import significant, uncertain
 from pixmetry.report.page import Figure
 
 TITLES = {
@@ -50,7 +50,7 @@ def summary_sentence(found: TargetViews) -> str:
             f"It moves the centre of their light by {significant(moved)} px (rms of x and y); outlines fitted with a slope do not move. "
         )
     if np.isfinite(found.slope):
-        text += f"It explains {found.slope:.2f} ± {significant(found.u_slope)} of what the centres of light show. "
+        text += f"It explains {uncertain(found.slope, found.u_slope, '').joined()} of what the centres of light show. "
     if found.eccentricity_px is not None and found.eccentricity_px.max() > 0:
         most = significant(float(found.eccentricity_px.max()))
         text += f"The ellipses' centres lie up to {most} px beside the images of the circles' centres."

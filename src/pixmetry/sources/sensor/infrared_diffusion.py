@@ -111,7 +111,10 @@ def truth(params: InfraredDiffusion, signal: Signal, stream: Stream) -> Mapping[
 
 
 def measure(observations: Observations) -> Estimates:
-    """Diffusion length, or its limit, from the blur of targets in infrared light against that in visible light."""
+    """Diffusion length, or its limit, from the blur of targets in infrared light against that in visible light.
+
+    The wavelength is that of the campaign's light, where it is stated: the length is the sensor's at all wavelengths.
+    """
     bands, failed = observations.bands, observations.failed.get("bands", "")
     fit = of_pictures(
         None if bands is None else bands.diffusion,
@@ -123,7 +126,8 @@ def measure(observations: Observations) -> Estimates:
     )
     stated = observations.stated
     assert bands is not None and stated.pitch_x_um is not None
-    known = [("wavelength_nm", bands.long_nm, "nm"), ("pitch_x_um", stated.pitch_x_um, "µm")]
+    light_nm = stated.wavelength_nm if stated.wavelength_nm is not None and 300 <= stated.wavelength_nm <= 1100 else bands.long_nm
+    known = [("wavelength_nm", light_nm, "nm"), ("pitch_x_um", stated.pitch_x_um, "µm")]
     known.append(("pitch_y_um", stated.pitch_y_um or stated.pitch_x_um, "µm"))
     return fit.join(Estimates.from_rows([(name, value, 0.0, np.inf, unit) for name, value, unit in known]))
 
