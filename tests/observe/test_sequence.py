@@ -95,7 +95,7 @@ def test_bands_over_the_rows_tell_the_frequency_and_the_depth(rng: np.random.Gen
 
 def test_two_frame_rates_unfold_the_frequency_and_one_does_not(rng: np.random.Generator):
     groups = []
-    for period in (0.04, 0.0388):
+    for period in (0.04, 0.0396):
         body = Body(exposure_s=0.003, period_s=period)
         groups.append(taken(sequence(rng, 60, None, Lamp(0.04, 103.3), body, Scene(patch=0)), body))
     dark = dark_of(rng, Body())

@@ -12,6 +12,7 @@ from pixmetry.budget.monte_carlo import Crop
 from pixmetry.budget.records import SUM, Budget
 from pixmetry.camera.camera import Camera
 from pixmetry.camera.colour_bands import ColourBands
+from pixmetry.camera.dark_rows import DarkRows
 from pixmetry.camera.frame_sequence import FrameSequences
 from pixmetry.camera.observations import (
     ActiveArea,
@@ -117,6 +118,7 @@ class Assessment:
             if self.observations.dark_temperatures is None
             else dark_temperatures_record(self.observations.dark_temperatures),
             "light_off": None if self.observations.light_off is None else light_off_record(self.observations.light_off),
+            "dark_rows": None if self.observations.dark_rows is None else dark_rows_record(self.observations.dark_rows),
             "sequences": None if self.observations.sequences is None else sequences_record(self.observations.sequences),
             "edges": None if self.observations.edges is None else edges_record(self.observations.edges),
             "blocks": None if self.observations.blocks is None else blocks_record(self.observations.blocks, self.observations.storage),
@@ -268,6 +270,17 @@ def light_off_record(found: LightSteps) -> dict[str, Any]:
         for s in found.steps
     ]
     return {"values": found.fit.to_records(), "refused": list(found.refused), "sequences": each}
+
+
+def dark_rows_record(found: DarkRows) -> dict[str, Any]:
+    """The plain record of the rows of dark frames."""
+    return {
+        "frames": found.frames,
+        "line_px": found.line_px,
+        "hum": _joint_record(found.hum),
+        "flicker": _joint_record(found.flicker),
+        "taken_dn2": {name: list(value) for name, value in found.taken.items()},
+    }
 
 
 def sequences_record(found: FrameSequences) -> dict[str, Any]:

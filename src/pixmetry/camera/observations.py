@@ -16,6 +16,7 @@ import numpy as np
 from pixmetry.camera.code_table import CodeTable
 from pixmetry.camera.colour_bands import ColourBands
 from pixmetry.camera.covered import Covered
+from pixmetry.camera.dark_rows import DarkRows
 from pixmetry.camera.drift_series import DriftSeries
 from pixmetry.camera.frame_sequence import FrameSequences
 from pixmetry.camera.motion_series import MotionSeries
@@ -808,6 +809,7 @@ class Observations:
     focus: FocusOverFrame | None = None
     light_off: LightSteps | None = None
     spots: BrightSpots | None = None
+    dark_rows: DarkRows | None = None  # of the stack of dark frames
     dark_temperatures: DarkTemperatures | None = None
     sensor: str | None = None  # ccd, cmos or cid, where it was said
     response: Response | None = None

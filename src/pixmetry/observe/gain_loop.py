@@ -227,12 +227,12 @@ def _fit(data: LoopData, names: tuple[str, ...], delay: int, gaps: tuple[int, ..
     frames = len(data.u)
     chi2, dof = float(2 * found.cost), max(frames - len(every), 1)
     scatter = float(np.sqrt(max(chi2 / dof, 1.0)))
-    covariance = _inverse(found.jac) * scatter**2 * _memory(found.fun)
+    covariance = inverse_of(found.jac) * scatter**2 * _memory(found.fun)
     fitted = _model(every, found.x, data, delay, gaps)
     return LoopFit(every, found.x, covariance, fitted, fitted - _path(every, found.x, data, delay, gaps), chi2, scatter, dof, delay, gaps)
 
 
-def _inverse(jacobian: np.ndarray) -> np.ndarray:
+def inverse_of(jacobian: np.ndarray) -> np.ndarray:
     """Covariance of the parameters; large, not small, for what the data do not tell."""
     scale = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-6)
     lengths, directions = np.linalg.eigh((jacobian / scale).T @ (jacobian / scale))
@@ -270,7 +270,7 @@ def _with_gaps(data: LoopData, found: LoopFit) -> LoopFit:
     """The fit with steps set free where frames are missing: where one alone explains most of what is left."""
     extra = tuple(n for n in found.names if n in ("lowest", "highest", *WAVE))
     for _ in range(MOST_GAPS):
-        if found.scatter < 3:
+        if found.scatter < 3 or found["kappa"] < 5 * found.u("kappa"):
             return found
         begin = dict(zip(found.names, found.values.tolist(), strict=True))
         jumps = np.abs(np.diff(data.log_gain - found.fitted))

@@ -10,9 +10,11 @@ import numpy as np
 from pixmetry.camera.frame_sequence import FrameSequence, LampWave
 from pixmetry.camera.observations import Observations
 from pixmetry.core.number import ONE_SIDED_95, Estimates
+from pixmetry.observe.gain_loop import inverse_of
 
 CHANCE = 1e-4  # of taking noise for a wave over rows and frames
 LEAST_ROWS = 32
+EXTRA = 6.0  # in power over the floor, which is a median of few ordinates
 LEAST_CYCLES = 0.2
 PAD = 3  # ordinates of the periodogram for each independent one
 ALIKE = 0.2  # largest scatter of a lamp's wave along the rows, over the wave
@@ -55,8 +57,8 @@ def row_wave(
     Notes
     -----
     The mean over the rows of each frame is left out: it has the frame's factor in it. So a wave needs `LEAST_CYCLES` over the rows to be
-    seen here. Searched is the two-dimensional periodogram, over what the means leave of each frequency; an ordinate of noise is
-    exponentially distributed about the median over ln 2 (Schuster 1898). u is the Cramér-Rao bound of a tone by the scatter of what is
+    seen here. Searched is the two-dimensional periodogram; an ordinate of noise is exponentially distributed about the median over ln 2
+    (Schuster 1898). u is the Cramér-Rao bound of a tone by the scatter of what is
     left.
     """
     light = light_of_rows(rows, mean, gain, offset, black, static)
@@ -68,23 +70,41 @@ def row_wave(
         return None
     if start is not None:
         return _refined(value, place, row, start.per_frame, start.per_row)
+    found = strongest_wave(value, place, row)
+    if found is None:
+        return None
+    parts = [light_of_rows(rows, mean, gain, offset, black, static & part) for part in _across(static, rows)]
+    return found if _is_alike(found, parts, place) else None
+
+
+def strongest_wave(value: np.ndarray, place: np.ndarray, row: np.ndarray) -> LampWave | None:
+    """The strongest sinusoid over frames and rows of values without the means of frames and of rows; None where none stands out.
+
+    The floor of each frequency over the rows is the median over those from frame to frame: noise that rows share is no wave.
+    """
     k = np.rint(place).astype(int)
     grid = np.zeros((PAD * (int(k[-1]) + 1), PAD * int(row[-1] + 1)))
     grid[k[:, None], row] = value
     power = np.abs(np.fft.rfft2(grid)) ** 2
     per_row, span = np.arange(power.shape[1]) / grid.shape[1], int(row[-1] - row[0] + 1)
-    power /= np.maximum(1 - np.sinc(per_row * span) ** 2, 1e-9)  # what the mean of each frame takes with it
-    power[:, per_row * span < LEAST_CYCLES] = 0.0
-    floor = float(np.median(power[power > 0])) / np.log(2)
-    peak = np.unravel_index(int(np.argmax(power)), power.shape)
-    if power[peak] < floor * np.log(power.size / PAD**2 / CHANCE):
+    allowed = per_row * span >= LEAST_CYCLES
+    power = power[:, allowed]
+    floor = np.median(power, axis=0) / np.log(2)
+    ratio = power / np.maximum(floor, 1e-3 * np.median(floor))
+    peak = np.unravel_index(int(np.argmax(ratio)), ratio.shape)
+    if ratio[peak] < np.log(ratio.size / PAD**2 / CHANCE) + EXTRA:
         return None
     per_frame = (peak[0] / grid.shape[0] + 0.5) % 1.0 - 0.5
-    found = _refined(value, place, row, per_frame, float(per_row[peak[1]]))
+    found = _refined(value, place, row, per_frame, float(per_row[allowed][peak[1]]))
     if found is None:
         return None
-    parts = [light_of_rows(rows, mean, gain, offset, black, static & part) for part in _across(static, rows)]
-    return found if _is_alike(found, parts, place) else None
+    wave = found.light(place, row) - 1
+    wave = wave - wave.mean(axis=1, keepdims=True)
+    grid[k[:, None], row] = value - (wave - wave.mean(axis=0))
+    floor = np.median(np.abs(np.fft.rfft2(grid)) ** 2, axis=0)[allowed]
+    coloured = float(np.sqrt(max(floor[peak[1]] / np.mean(floor), 1.0)))
+    u = {name: coloured * getattr(found, name) for name in ("u_amplitude_rel", "u_per_frame", "u_per_row")}
+    return replace(found, **u) if found.amplitude_rel > LEAST_WAVE * u["u_amplitude_rel"] else None
 
 
 def _across(static: np.ndarray, rows: np.ndarray) -> list[np.ndarray]:
@@ -140,12 +160,17 @@ def _refined(value: np.ndarray, place: np.ndarray, row: np.ndarray, per_frame: f
         basis = np.stack([wave(np.array([1.0, 0.0, u, v])).ravel(), wave(np.array([0.0, 1.0, u, v])).ravel()], axis=1)
         return np.asarray(np.linalg.lstsq(basis, value.ravel(), rcond=None)[0])
 
-    first = np.array([*amplitude(per_frame, per_row), per_frame, per_row])
-    size = float(np.hypot(*first[:2]))
-    scale = [size, size, 0.1 / max(np.ptp(place), 1.0), 0.1 / max(np.ptp(row), 1.0)]
-    found = least_squares(lambda p: (wave(p) - value).ravel(), first, x_scale=scale, max_nfev=60)
+    span = max(float(np.ptp(row)), 1.0)
+    starts = [per_row] if per_row * span > 2 else [per_row, 0.25 / span, 0.5 / span, 1.0 / span]  # the means hide how little it turns
+    tried = []
+    for start in starts:
+        first = np.array([*amplitude(per_frame, start), per_frame, start])
+        size = max(float(np.hypot(*first[:2])), 1e-12)
+        scale = [size, size, 0.1 / max(np.ptp(place), 1.0), 0.1 / span]
+        tried.append(least_squares(lambda p: (wave(p) - value).ravel(), first, x_scale=scale, max_nfev=60))
+    found = min(tried, key=lambda f: f.cost)
     dof = max(value.size - len(value) - value.shape[1] - 4, 1)
-    covariance = np.linalg.pinv(found.jac.T @ found.jac, rcond=1e-20, hermitian=True) * 2 * found.cost / dof
+    covariance = inverse_of(found.jac) * 2 * found.cost / dof
     a, b = found.x[:2]
     size = float(np.hypot(a, b))
     slope = np.array([a, b]) / size

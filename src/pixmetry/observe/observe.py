@@ -29,6 +29,7 @@ from pixmetry.core.threads import single_threaded_blas
 from pixmetry.observe import photon_transfer_model as model
 from pixmetry.observe.colour_cells import balanced, find_colour_cells
 from pixmetry.observe.companding import find_code_table, without_steps
+from pixmetry.observe.dark_rows import reduce_dark_rows, without_hum
 from pixmetry.observe.defects import find_defects, without_hot_pixels
 from pixmetry.observe.edges import LINE_START_PX
 from pixmetry.observe.experiment import PictureGroup
@@ -51,7 +52,7 @@ from pixmetry.observe.photon_transfer_levels import (
     with_stacks,
 )
 from pixmetry.observe.spatial_fit import fit_dark_pattern, fit_spatial, with_shading_of, without_columns, without_defects
-from pixmetry.observe.stack import SATURATED_FRACTION, StackAccumulator, choose_stacks, same_exposure
+from pixmetry.observe.stack import SATURATED_FRACTION, RowMeans, StackAccumulator, choose_stacks, same_exposure
 from pixmetry.observe.tap_steps import evened, find_taps, with_steps_in_slope
 
 __all__ = ["Group", "observe"]
@@ -65,6 +66,7 @@ ONE_LIGHT = "from one light level: u includes that the response may deviate from
 class _Stack:
     moments: StackMoments
     spectra: Spectra
+    rows: RowMeans | None = None
 
 
 def observe(
@@ -129,7 +131,7 @@ def observe(
             kept = stacks[group.kind].get(group.exposure_s)
             if kept is None or sums.moments.n_frames > kept.moments.n_frames:
                 stack = sums.moments.result(group.exposure_s)
-                stacks[group.kind][group.exposure_s] = _Stack(stack, sums.spectra.result(stack.mean_map_dn))
+                stacks[group.kind][group.exposure_s] = _Stack(stack, sums.spectra.result(stack.mean_map_dn), sums.rows)
     levels = {kind: found or stacked[kind] for kind, found in levels.items()}  # where there are only stacks, these
     if pictures and shape is not None and not (levels["dark"] or levels["bright"]):
         alone = Observations(
@@ -170,7 +172,11 @@ def observe(
         even = evened(dark_stack, bright_stack, taps)
     with single_threaded_blas():
         rising = LINE_START_PX if told.interface == "analogue" else 0
-        defects, spatial, patterns = _spatial(dark_stack, even, dark_spectra, Linearity.of(fit, bits), _dnl_lsb(codes), notes, rising)
+        defects, spatial, found_patterns = _spatial(dark_stack, even, dark_spectra, Linearity.of(fit, bits), _dnl_lsb(codes), notes, rising)
+        rows = None
+        if dark is not None and dark.rows is not None:
+            rows = reduce_dark_rows(dark.rows, dark.spectra, dark.moments.shape, told, found_patterns, noise_filter)
+        patterns = without_hum(found_patterns, rows, dark_spectra)
     if spatial is not None and taps is not None:
         spatial = with_steps_in_slope(spatial, taps)
     if spatial is not None and noise_filter is not None and dark_stack is not None and bright_stack is not None:
@@ -186,6 +192,7 @@ def observe(
         spatial_fit=spatial,
         defects=defects,
         patterns=patterns,
+        dark_rows=rows,
         code_errors=codes,
         code_table=table,
         colour_cells=cells,

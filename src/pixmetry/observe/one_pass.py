@@ -18,7 +18,7 @@ from pixmetry.observe.defects import tail_of_counts
 from pixmetry.observe.experiments import EXPERIMENTS
 from pixmetry.observe.moments import LevelAccumulator, LevelSummary, level_moments, summarize_pair
 from pixmetry.observe.noise_covariance import FrameSuccession, LagProducts, lag_products, white_square
-from pixmetry.observe.stack import GroupReduction, new_group
+from pixmetry.observe.stack import GroupReduction, RowMeans, new_group
 
 Frame = np.ndarray | Callable[[], np.ndarray]
 SAMPLES = 8  # frames of a stack, of which every other one is kept
@@ -116,6 +116,8 @@ class _Sums:
         experiment = EXPERIMENTS.get(group.kind)
         if experiment is not None and experiment.sums is not None:
             self.reduction.of_pictures = experiment.sums()
+        if group.kind == "dark" and self.stack:
+            self.reduction.rows = RowMeans()
         self.summary: Reduced | None = None
         self._lock = threading.Lock()
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -13,6 +13,7 @@ from pixmetry.core.errors import InputError
 from pixmetry.observe.moments import FrameMoments, LevelAccumulator
 from pixmetry.observe.spectra import SpectraAccumulator
 
+PARTS = 4  # of a row, along which the phase of a hum is followed
 EQUAL_EXPOSURE = 0.01  # relative; clocks round
 SATURATED_FRACTION = 0.002  # EMVA 1288 R4.0 §6.6
 
@@ -63,16 +64,28 @@ class FrameSums(Protocol):
 
 
 @dataclass
+class RowMeans:
+    """Means of parts of the rows of each frame, by its index."""
+
+    means: dict[int, np.ndarray] = field(default_factory=dict)  # shape (rows, parts), float64
+
+    def add(self, frame: np.ndarray, index: int) -> None:
+        """Add the frame of this index."""
+        self.means[index] = np.stack([part.mean(axis=1, dtype=float) for part in np.array_split(frame, PARTS, axis=1)], axis=1)
+
+
+@dataclass
 class GroupReduction:
     """All accumulators of one group of frames; each frame is read once.
 
     ``spectra`` is ``None`` for the short groups of an exposure series, and for pictures of targets; ``of_pictures`` is what the experiment
-    of a kind of pictures sums.
+    of a kind of pictures sums; ``rows`` belongs to stacks of dark frames.
     """
 
     moments: LevelAccumulator | StackAccumulator
     spectra: SpectraAccumulator | None = None
     of_pictures: FrameSums | None = None
+    rows: RowMeans | None = None
 
     def add(self, frame: np.ndarray, index: int | None = None) -> None:
         """Add one frame; see :meth:`FrameMoments.add`."""
@@ -82,6 +95,8 @@ class GroupReduction:
             self.spectra.add(frame, index)
         if self.of_pictures is not None:
             self.of_pictures.add(frame, index)
+        if self.rows is not None:
+            self.rows.add(frame, index)
 
 
 def new_group(bits: int, kind: str, spectra_pairs: int = 8) -> GroupReduction:

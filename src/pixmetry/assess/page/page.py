@@ -96,7 +96,7 @@ def _pictures(assessment: Assessment) -> list[Section]:
     from pixmetry.assess.page.light_off import light_off_section
     from pixmetry.assess.page.lines import lines_section
     from pixmetry.assess.page.response import response_section
-    from pixmetry.assess.page.sequence import sequence_section
+    from pixmetry.assess.page.sequence import dark_rows_section, sequence_section
     from pixmetry.assess.page.speckle import speckle_section
     from pixmetry.assess.page.spots import spots_section
     from pixmetry.assess.page.views import views_section
@@ -113,6 +113,7 @@ def _pictures(assessment: Assessment) -> list[Section]:
         *([] if seen.area is None else [area_section(seen.area)]),
         *([] if seen.covered is None else [covered_section(seen.covered)]),
         *([] if seen.light_off is None else [light_off_section(seen.light_off)]),
+        *([] if seen.dark_rows is None else [dark_rows_section(seen.dark_rows)]),
         *([] if seen.sequences is None else [sequence_section(seen.sequences)]),
         *([] if seen.drift is None else [drift_section(seen.drift)]),
         *([] if seen.motion is None else [motion_section(seen.motion)]),

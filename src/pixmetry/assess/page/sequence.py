@@ -1,9 +1,10 @@
-"""The section of an assessment's page on frames in a row: the gain of each, and what moves it."""
+"""The sections of an assessment's page on frames in a row (the gain of each, and what moves it) and on the rows of dark frames."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from pixmetry.camera.dark_rows import DarkRows
 from pixmetry.camera.frame_sequence import FrameSequence, FrameSequences
 from pixmetry.core.number import Number
 from pixmetry.report import Column, Points, Section, Table
@@ -79,3 +80,48 @@ def gain_figure(s: FrameSequence, number: int) -> Figure:
         )
         alt = f"Gain of each of {len(frame)} frames over their mean, with the fitted loop, and the light of the scene that drives it."
         return Figure(figure, f"sequence-{number}", alt, caption)
+
+
+def dark_rows_section(found: DarkRows) -> Section:
+    """Sentences on hum and 1/f noise, and the spectrum of the rows."""
+    section = Section("Rows of dark frames", name="dark-rows").add_text(hum_sentence(found)).add_text(flicker_noise_sentence(found))
+    return section.add(spectrum_figure(found))
+
+
+def hum_sentence(found: DarkRows) -> str:
+    """Whether a hum is in the rows."""
+    hum = found.hum
+    if "amplitude_dn" not in hum:
+        return f"Hum is not told: {hum.reasons['amplitude_dn']}."
+    size = printed_number(hum["amplitude_dn"]).joined()
+    if hum.limits:
+        return f"The rows show no hum; its amplitude is {size} DN."
+    at = f"{printed_number(hum['per_row']).joined()} cycles a row"
+    hertz = f", {printed_number(hum['frequency_hz']).joined()} Hz" if "frequency_hz" in hum else ""
+    return f"A hum of {size} DN lies over the rows, {at}{hertz} ({hum.reasons['frequency_hz']})."
+
+
+def flicker_noise_sentence(found: DarkRows) -> str:
+    """Whether the noise goes as 1/f along the read-out."""
+    flicker = found.flicker
+    if "rms_dn" not in flicker:
+        return f"1/f noise is not told: {flicker.reasons['rms_dn']}."
+    size = printed_number(flicker["rms_dn"]).joined()
+    if flicker.limits:
+        return f"The spectra need no 1/f noise; it is {size} DN ({flicker['rms_dn'].reason})."
+    corner = printed_number(flicker["corner_rel"]).joined()
+    return f"The 1/f noise along the read-out is {size} DN ({flicker['rms_dn'].reason}), up to {corner} of the pixel clock."
+
+
+def spectrum_figure(found: DarkRows) -> Figure:
+    """Spectrum of the means of rows, from frame to frame."""
+    with canvas(2.4) as (figure, axes):
+        line(axes, found.frequency[1:], found.power_dn2[1:], color=BLUE, linewidth=0.8)
+        line(axes, found.frequency[1:], found.fitted_dn2[1:], color=INK, linewidth=0.8, linestyle="--")
+        axes.set_yscale("log")
+        axes.set_xlabel("cycles a row")
+        axes.set_ylabel("power / DN²")
+        caption = "Spectrum of the means of dark rows, without a hum that was found. Dashed: fit of white noise, row noise and 1/f noise."
+        return Figure(
+            figure, "dark-rows", f"Spectrum of the means of dark rows. {hum_sentence(found)} {flicker_noise_sentence(found)}", caption
+        )

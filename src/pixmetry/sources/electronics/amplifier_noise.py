@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from pixmetry.camera.contribution import Contribution, Probe
+from pixmetry.camera.dark_rows import without_variance
 from pixmetry.camera.observations import Observations, PatternList
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
@@ -52,6 +53,10 @@ def measure(observations: Observations) -> Estimates:
     )
     found = None if observations.patterns is None else observations.patterns.strongest()
     fit, series = observations.photon_transfer_fit, observations.photon_transfer
+    rows = observations.dark_rows
+    if rows is not None and fit is not None and "gain_dn_per_e" in fit:
+        square, u = (v / fit["gain_dn_per_e"].value ** 2 for v in rows.taken["pixel"])
+        noise = without_variance(noise, "white_e", square, u, "1/f noise, which is measured by itself,")
     if found is None or fit is None or series is None or not found.moving.any() or noise.limits:
         return noise
     return _without_moving_waves(noise, fit["gain_dn_per_e"].value, found, series.dark.n_frames)

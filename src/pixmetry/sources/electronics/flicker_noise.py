@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
 from pixmetry.camera.contribution import Contribution, Probe
+from pixmetry.camera.dark_rows import octave_covariance, octave_periods
+from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
 from pixmetry.core.arrays import Array
+from pixmetry.core.errors import MeasureError
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Grid, Stream
 from pixmetry.sources.electronics._kernels import add_interpolated
 
@@ -35,16 +40,9 @@ class FlickerNoise(Parameters):
 
 
 def octaves(params: FlickerNoise) -> list[tuple[float, float]]:
-    """Distance of the nodes in pixel clocks, and share of the variance, of every octave.
-
-    Straight lines between independent nodes P apart have the density P sinc⁴(f P), up to a factor; its sum over octaves of P is 1/f
-    within 0.4 %, as far as there are octaves on both sides. The fastest counts twice: to low frequencies it is what all faster ones
-    would be together, P/2 + P/4 + … = P. So the density is right within 0.1 dB up to a quarter of the corner, 1 dB at half of it.
-    """
-    shares = np.ones(params.octaves)
-    shares[0] = 2.0
-    periods = 0.5 / params.corner_rel * 2.0 ** np.arange(params.octaves)
-    return [(float(p), float(s)) for p, s in zip(periods, shares / shares.sum(), strict=True)]
+    """Distance of the nodes in pixel clocks, and share of the variance, of every octave: see `octave_periods`."""
+    periods, shares = octave_periods(params.corner_rel, params.octaves)
+    return list(zip(periods.tolist(), shares.tolist(), strict=True))
 
 
 def forward(params: FlickerNoise, signal: Signal, stream: Stream) -> Signal:
@@ -70,14 +68,32 @@ def forward(params: FlickerNoise, signal: Signal, stream: Stream) -> Signal:
 
 
 def covariance(params: FlickerNoise, lag_px: np.ndarray) -> np.ndarray:
-    """Covariance in e-² at lags in pixel clocks: per octave the cubic B-spline, a triangle with itself, over its value 2/3 at 0."""
-    u = np.abs(np.asarray(lag_px, float))
-    out = np.zeros_like(u)
-    for period, share in octaves(params):
-        v = np.minimum(u / period, 2.0)
-        out += share * np.where(v < 1, 1 - 1.5 * v**2 + 0.75 * v**3, 0.25 * (2 - v) ** 3)
-    covariance_e2: Array = params.rms_e**2 * out
+    """Covariance in e-² at lags in pixel clocks."""
+    covariance_e2: Array = params.rms_e**2 * octave_covariance(params.corner_rel, params.octaves, lag_px)
     return covariance_e2
+
+
+def measure(observations: Observations) -> Estimates:
+    """Read the 1/f noise off the spectra of dark rows and of their means, down to one cycle a frame.
+
+    The same noise is then no longer part of the white noise and of the noise of the rows (`electronics.amplifier_noise`,
+    `electronics.row_noise`).
+    """
+    where, rows, fit = "electronics.flicker_noise", observations.dark_rows, observations.photon_transfer_fit
+    if rows is None:
+        remedy = "take 16 or more dark frames (kind: dark), of 48 rows or more"
+        raise MeasureError("needs the spectrum of dark rows along the read-out", where=where, remedy=remedy)
+    if "rms_dn" not in rows.flicker:
+        raise MeasureError(rows.flicker.reasons["rms_dn"], where=where)
+    if fit is None or "gain_dn_per_e" not in fit:
+        what = f"1/f noise of {rows.flicker['rms_dn'].value:.2g} DN: in electrons it needs the gain"
+        raise MeasureError(what, where=where, remedy="take bright frames at several exposures")
+    gain, told = fit["gain_dn_per_e"], rows.flicker
+    found = told.scaled({"rms_dn": (1 / gain.value, "e-")}).select({"rms_e": "rms_dn", **{n: n for n in told.names if n != "rms_dn"}})
+    covariance = found.covariance.copy()
+    covariance[0, 0] += (found.values[0] * gain.u / gain.value) ** 2
+    line = Estimates.from_rows([("line_px", rows.line_px, 0.0, np.inf, "px")])
+    return replace(found, covariance=covariance).join(line)
 
 
 def propagate(params: FlickerNoise, probe: Probe) -> Contribution:
@@ -119,6 +135,7 @@ SOURCE = Source(
     typical=FlickerNoise(rms_e=10.0),
     bound=FlickerNoise(rms_e=60.0, corner_rel=0.2),
     forward=forward,
+    measure=measure,
     propagate=propagate,
     gum_class="T",
     equation="n' = n + ζ(t),  t = r t_line + c t_pixel (r: line of the field),  S_ζ(f) ∝ 1/f from f_c/2^octaves to f_c",
@@ -129,7 +146,6 @@ SOURCE = Source(
     ),
     advice="Use correlated double sampling with a short interval; clamp every row on its optically black pixels.",
     reasons={
-        "measure": "not measured: needs the spectrum of dark rows along the read-out; the photon transfer has it as white and row noise",
         "correct": "noise cannot be removed; optically black columns remove the part that is common to a row",
     },
 )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pixmetry.camera.contribution import Contribution, Probe
+from pixmetry.camera.dark_rows import without_variance
 from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
@@ -29,13 +30,25 @@ def forward(params: RowNoise, signal: Signal, stream: Stream) -> Signal:
 
 
 def measure(observations: Observations) -> Estimates:
-    """Read the temporal row and column variance of dark pairs, less what white noise gives to a mean of a line."""
-    return observations.fitted(
+    """Read the temporal row and column variance of dark pairs, less what white noise gives to a mean of a line.
+
+    Hum and 1/f noise along the read-out, where dark rows show them, are taken off: they count under their own names.
+    """
+    noise = observations.fitted(
         {"row_e": "row_noise_e", "column_e": "column_noise_e"},
         "row noise needs a photon-transfer series with dark frames",
         where="electronics.row_noise",
         remedy="take dark pairs",
     )
+    rows, fit = observations.dark_rows, observations.photon_transfer_fit
+    if rows is None or fit is None or "gain_dn_per_e" not in fit:
+        return noise
+    hum, flicker, series = rows.taken["hum"], rows.taken["row"], observations.series.dark
+    # two frames of phases φ differ by A²/2·(1 − cos Δφ) in their variance: over N levels it scatters by A²/2·√(N/2)/Σ(F − 1)
+    scatter = hum[0] * np.sqrt(len(series.n_frames) / 2) / max(float((series.n_frames - 1).sum()), 1.0)
+    square, u = (hum[0] + flicker[0]) / fit["gain_dn_per_e"].value ** 2, np.linalg.norm([hum[1], flicker[1], scatter])
+    u = float(u) / fit["gain_dn_per_e"].value ** 2
+    return without_variance(noise, "row_e", square, u, "hum or 1/f noise, which is measured by itself,")
 
 
 def propagate(params: RowNoise, probe: Probe) -> Contribution:

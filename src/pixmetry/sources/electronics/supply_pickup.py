@@ -9,10 +9,12 @@ from typing import Literal
 import numpy as np
 
 from pixmetry.camera.contribution import Contribution, Probe
+from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
 from pixmetry.camera.waves import shift_per_dn, wave, without_wave
-from pixmetry.core.errors import InputError
+from pixmetry.core.errors import InputError, MeasureError
+from pixmetry.core.number import Estimates
 from pixmetry.core.random import Grid, Stream
 
 
@@ -81,6 +83,27 @@ def forward(params: SupplyPickup, signal: Signal, stream: Stream) -> Signal:
         added[index, rows] = wave(field, nu_x, nu_y, (params.frequency_hz * field.time_s) % 1.0 + phase + jump % 1.0)
     added *= np.float32(params.amplitude_dn)
     return signal.with_data(np.add(signal.data, added, out=added))
+
+
+def measure(observations: Observations) -> Estimates:
+    """Read a hum off the means of dark rows: amplitude, and with the stated line time its frequency.
+
+    A wave that turns along the rows too is measured as `grabber.phase_pattern`, and is not counted here.
+    """
+    where, rows, stated = "electronics.supply_pickup", observations.dark_rows, observations.stated
+    if rows is None:
+        remedy = "take 16 or more dark frames (kind: dark), of 48 rows or more"
+        raise MeasureError("needs the means of the rows of dark frames", where=where, remedy=remedy)
+    if "amplitude_dn" not in rows.hum:
+        raise MeasureError(rows.hum.reasons["amplitude_dn"], where=where)
+    if rows.hum.limits:
+        return rows.hum
+    if "frequency_hz" not in rows.hum or stated.line_time_us is None:
+        raise MeasureError(rows.hum.reasons["frequency_hz"], where=where)
+    found = rows.hum.select(("amplitude_dn", "frequency_hz"))
+    pixel_ns = 0.0 if stated.pixel_clock_mhz is None else 1e3 / stated.pixel_clock_mhz
+    clocks = [("line_time_us", stated.line_time_us, 0.0, np.inf, "µs"), ("pixel_time_ns", pixel_ns, 0.0, np.inf, "ns")]
+    return found.join(Estimates.from_rows(clocks))
 
 
 def correct(params: SupplyPickup, signal: Signal, maps: Mapping[str, np.ndarray]) -> Signal:
@@ -153,6 +176,7 @@ SOURCE = Source(
     typical=SupplyPickup(amplitude_dn=0.3),
     bound=SupplyPickup(amplitude_dn=1.0, frequency_hz=1.001e6),
     forward=forward,
+    measure=measure,
     correct=correct,
     propagate=propagate,
     gum_class="F",
@@ -167,10 +191,4 @@ SOURCE = Source(
         "Filter and shield the supply. Against mains, choose a frame rate at which the stripes roll, and average over a "
         "beat. A known frequency can be fitted and subtracted in every frame."
     ),
-    reasons={
-        "measure": (
-            "frames show only what is left of the frequency in cycles per pixel after whole turns between pixels and lines, not the hertz "
-            "nor the clocks; a line of the spectrum is measured as grabber.phase_pattern, and would count twice"
-        ),
-    },
 )
