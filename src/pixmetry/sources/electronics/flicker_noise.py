@@ -81,7 +81,7 @@ def measure(observations: Observations) -> Estimates:
     """
     where, rows, fit = "electronics.flicker_noise", observations.dark_rows, observations.photon_transfer_fit
     if rows is None:
-        remedy = "take 16 or more dark frames (kind: dark), of 48 rows or more"
+        remedy = "take 16 or more dark frames, of 48 rows or more"
         raise MeasureError("needs the spectrum of dark rows along the read-out", where=where, remedy=remedy)
     if "rms_dn" not in rows.flicker:
         raise MeasureError(rows.flicker.reasons["rms_dn"], where=where)

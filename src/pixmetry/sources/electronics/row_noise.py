@@ -46,8 +46,8 @@ def measure(observations: Observations) -> Estimates:
     hum, flicker, series = rows.taken["hum"], rows.taken["row"], observations.series.dark
     # two frames of phases φ differ by A²/2·(1 − cos Δφ) in their variance: over N levels it scatters by A²/2·√(N/2)/Σ(F − 1)
     scatter = hum[0] * np.sqrt(len(series.n_frames) / 2) / max(float((series.n_frames - 1).sum()), 1.0)
-    square, u = (hum[0] + flicker[0]) / fit["gain_dn_per_e"].value ** 2, np.linalg.norm([hum[1], flicker[1], scatter])
-    u = float(u) / fit["gain_dn_per_e"].value ** 2
+    gain2 = fit["gain_dn_per_e"].value ** 2
+    square, u = (hum[0] + flicker[0]) / gain2, float(np.linalg.norm([hum[1], flicker[1], scatter])) / gain2
     return without_variance(noise, "row_e", square, u, "hum or 1/f noise, which is measured by itself,")
 
 

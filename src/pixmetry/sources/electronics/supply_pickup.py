@@ -92,7 +92,7 @@ def measure(observations: Observations) -> Estimates:
     """
     where, rows, stated = "electronics.supply_pickup", observations.dark_rows, observations.stated
     if rows is None:
-        remedy = "take 16 or more dark frames (kind: dark), of 48 rows or more"
+        remedy = "take 16 or more dark frames, of 48 rows or more"
         raise MeasureError("needs the means of the rows of dark frames", where=where, remedy=remedy)
     if "amplitude_dn" not in rows.hum:
         raise MeasureError(rows.hum.reasons["amplitude_dn"], where=where)
