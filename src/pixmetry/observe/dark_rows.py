@@ -21,6 +21,7 @@ LEAST_CYCLES = 4.0  # of a hum over the rows
 FOUND_CHI2 = 25.0  # by which 1/f noise must improve the fit
 BINS = 40  # of the spectrum along the rows, evenly in the logarithm
 CORNERS = np.geomspace(0.004, 0.45, 14)
+LEAST_TURNS = 2.5  # of the corner along a row, for 1/f noise that shows in its spectrum
 TYPICAL_CORNER = 0.1  # for which a limit holds
 LEAST_WAVE = 12.0  # power of a wave over that of the noise of its column of the spectrum
 LEAST_FIXED_WAVE = 40.0  # the same in the mean of the frames, of which there is one only
@@ -326,6 +327,11 @@ def _flicker_of(
             ).x
         )
     )
+    if corner < LEAST_TURNS / cols:
+        slow = "the means of the rows change slowly from row to row, but the noise along the rows is white"
+        slow_shape = _shapes(corner, along, ordinates, size, line_px)
+        fitted = _rows_of(design(slow_shape) @ solved(slow_shape)[1], ordinates, len(data_h), power)
+        return replace(Estimates.empty(), reasons={"rms_dn": f"{slow}: no 1/f noise of the read-out"}), fitted, {}
     shape = _shapes(corner, along, ordinates, size, line_px)
     cost, values, _ = solved(shape)
     step = 1.05

@@ -97,7 +97,8 @@ def measure(observations: Observations) -> Estimates:
     if "amplitude_dn" not in rows.hum:
         raise MeasureError(rows.hum.reasons["amplitude_dn"], where=where)
     if rows.hum.limits:
-        return rows.hum
+        limit = rows.hum["amplitude_dn"]
+        raise MeasureError(f"no hum is found in the rows of dark frames: below {limit.value:.2g} DN ({limit.reason})", where=where)
     if "frequency_hz" not in rows.hum or stated.line_time_us is None:
         raise MeasureError(rows.hum.reasons["frequency_hz"], where=where)
     found = rows.hum.select(("amplitude_dn", "frequency_hz"))
