@@ -7,15 +7,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy import stats
-from sequence_frames import Body, Lamp, Loop, Scene, dark_frames, flats, sequence, taken
 
+from observe.sequence_frames import Body, Lamp, Loop, Scene, dark_frames, flats, sequence, taken
 from pixmetry import Frames, assess, campaign_of_arrays
 from pixmetry.assess.job import measure_sources, observe_campaign
 from pixmetry.camera.observations import Observations
 from pixmetry.core.errors import InputError
+from pixmetry.core.number import Estimates
 from pixmetry.core.progress import no_progress
 from pixmetry.files.images import write_frame
 from pixmetry.files.manifest import load_campaign
+from pixmetry.observe.sequence import mean_of_loops
 
 ALPHA = 1e-6
 
@@ -182,3 +184,67 @@ def test_page_results_and_budget_have_it(rng: np.random.Generator, tmp_path: Pat
     record = found.to_record()["sequences"]
     assert record["loop"]["names"][:2] == ["kappa", "target_dn"] and len(record["sequences"][0]["gain_rel"]) == 60
     assert found.camera["electronics.agc"].params.kappa == pytest.approx(0.3, abs=0.01)
+
+
+def test_frames_without_light_or_full_of_it_are_left_out(rng: np.random.Generator):
+    """A dark frame, one of zeros and one that is saturated all over; u is about 1e-3, six u."""
+    data = sequence(rng, 60, Loop(0.3))
+    data[20], data[35], data[47] = dark_frames(rng, 1, Body())[0], 0, 4095
+    seen = seen_of(taken(data), dark_of(rng, Body()))
+    kappa = seen.sequences.loop["kappa"]
+    assert abs(kappa.value - 0.3) < 6 * kappa.u and kappa.u < 0.01
+    assert any("3 of 60 frames are left out" in note for note in seen.notes)
+    assert any("missing after frame 20, 35, 47" in note for note in seen.notes)
+
+
+def test_a_pause_begins_another_sequence(rng: np.random.Generator):
+    """κ and target of both stretches, six u; one of less than 12 frames is refused by itself."""
+    data, times = sequence(rng, 70, Loop(0.3)), 0.04 * np.arange(70) + 3600.0 * (np.arange(70) >= 40) + 3600.0 * (np.arange(70) >= 65)
+    found = seen_of(taken(data, interval_s=None, times_s=tuple(times.tolist())), dark_of(rng, Body())).sequences
+    assert [len(s.gain_rel) for s in found.sequences] == [40, 25] and "sequence 3 of 3: 5 frames" in found.refused[0]
+    for name, truth in (("kappa", 0.3), ("target_dn", 700.0)):
+        assert abs(found.loop[name].value - truth) < 6 * found.loop[name].u
+
+
+def test_the_scale_of_codes_that_are_shifted_ends_below_the_highest_number(rng: np.random.Generator):
+    """12 bits in the upper ones of 16, a patch that saturates: what clipped frames ask is not used. Six u."""
+    data = 16 * sequence(rng, 60, Loop(target_dn=2200.0))
+    loop = seen_of(taken(data), Frames("dark", 0.001, 16 * dark_frames(rng, 4, Body())), bits=16).sequences.loop
+    for name, truth in (("kappa", 0.3), ("target_dn", 16 * 2200.0)):
+        assert abs(loop[name].value - truth) < 6 * loop[name].u
+    assert loop["kappa"].u < 0.01
+
+
+def test_dark_frames_that_are_cut_off_at_zero_leave_black_uncertain(rng: np.random.Generator):
+    """Noise below 0 is lost, and the dark level is 1.3 DN too high: u of the target holds that."""
+    body = Body(black=0.0)
+    target = seen_of(taken(sequence(rng, 60, Loop(), None, body), body), dark_of(rng, body)).sequences.loop["target_dn"]
+    assert abs(target.value - 700) < 3 * target.u and 0.3 < target.u < 5
+
+
+def test_frames_without_noise_or_contrast_do_not_end_the_run(rng: np.random.Generator):
+    for data in (np.full((20, 96, 128), 500, np.uint16), np.repeat(sequence(rng, 1), 20, axis=0)):
+        assert "does not change" in measure_sources(seen_of(taken(data), dark_of(rng, Body())))[1]["electronics.agc"]
+
+
+def test_no_limit_of_flicker_without_the_time_from_frame_to_frame(rng: np.random.Generator):
+    """25 frames a second all see a lamp of 100 Hz alike."""
+    data = sequence(rng, 40, None, Lamp(0.3, 100.0), None, Scene(patch=0))
+    assert "interval_s" in measure_sources(seen_of(taken(data, interval_s=None), dark_of(rng, Body())))[1]["optics.flicker"]
+
+
+def test_two_fields_in_one_frame_tell_no_lamp(rng: np.random.Generator):
+    body = Body(exposure_s=0.003, period_s=0.02)
+    fields = sequence(rng, 80, None, Lamp(0.2, 113.0), body, Scene(patch=0))
+    woven = np.where((np.arange(96) % 2 == 0)[:, None], fields[::2], fields[1::2])
+    told = measure_sources(seen_of(taken(woven, body, interval_s=0.04), dark_of(rng, body), line_time_us=64.0))[1]["optics.flicker"]
+    assert "each field as a frame" in told
+
+
+def test_black_that_sequences_share_is_not_averaged_out():
+    """Two sequences whose target is as uncertain as black: their mean is, too."""
+    own, black = np.array([1e-3, 0.01]), np.array([1e-5, 1.0])
+    joint = np.block([[np.diag(own**2) + np.outer(black, black), 1.0 * black[:, None]], [1.0 * black, np.ones((1, 1))]])
+    one = Estimates(("kappa", "target_dn", "black_dn"), np.array([0.3, 700.0, 32.0]), joint, np.full(3, 50.0), ("1", "DN", "DN"))
+    _, covariance, _, _ = mean_of_loops([one, one])
+    assert covariance[1, 1] == pytest.approx(1.0, rel=1e-3) and covariance[0, 0] == pytest.approx(own[0] ** 2 / 2, rel=1e-2)

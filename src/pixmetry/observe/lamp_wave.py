@@ -16,6 +16,7 @@ CHANCE = 1e-4  # of taking noise for a wave over rows and frames
 LEAST_ROWS = 32
 EXTRA = 6.0  # in power over the floor, which is a median of few ordinates
 LEAST_CYCLES = 0.2
+ROUNDING = 1e-9  # of the light: what frames that are copies of each other differ by
 PAD = 3  # ordinates of the periodogram for each independent one
 ALIKE = 0.2  # largest scatter of a lamp's wave along the rows, over the wave
 LEAST_WAVE = 6.0  # amplitude over its u
@@ -23,6 +24,7 @@ MAINS_HZ = (100.0, 120.0)  # light of lamps on mains of 50 and 60 Hz
 HIGHEST_HZ = 1000.0  # up to which the frequency of a lamp is sought
 LEAST_SINC = 0.02  # share of the depth that the exposure leaves, below which nothing is told
 METHOD = "sinusoid in the light of frames and rows; depth over what the exposure averages out"
+WOVEN = "the light of odd rows swings against that of even ones, as in two fields: list each field as a frame of its own, in order of time"
 UNFOLD = "take a second sequence at another frame rate (1 % off is enough), or, of a rolling shutter, state camera.line_time_us"
 
 
@@ -66,7 +68,7 @@ def row_wave(
         return None
     value, row = light
     frames, count = value.shape
-    if count < LEAST_ROWS:
+    if count < LEAST_ROWS or np.abs(value).max() < ROUNDING:
         return None
     if start is not None:
         return _refined(value, place, row, start.per_frame, start.per_row)
@@ -174,22 +176,25 @@ def _refined(value: np.ndarray, place: np.ndarray, row: np.ndarray, per_frame: f
     a, b = found.x[:2]
     size = float(np.hypot(a, b))
     slope = np.array([a, b]) / size
-    u = [float(np.sqrt(slope @ covariance[:2, :2] @ slope)), *np.sqrt(np.diag(covariance)[2:]).tolist()]
-    if found.x[3] <= 0 or found.x[3] > 0.5 or size < LEAST_WAVE * u[0]:
+    u = [float(np.sqrt(max(slope @ covariance[:2, :2] @ slope, 0.0))), *np.sqrt(np.maximum(np.diag(covariance)[2:], 0.0)).tolist()]
+    if found.x[3] <= 0 or size < LEAST_WAVE * u[0]:
         return None
-    phase = -float(np.arctan2(b, a)) / (2 * np.pi)
-    return LampWave(size, u[0], float(found.x[2] + 0.5) % 1.0 - 0.5, u[1], float(found.x[3]), u[2], phase)
+    phase, along, down = -float(np.arctan2(b, a)) / (2 * np.pi), float(found.x[2]), float(found.x[3])
+    if down > 0.5:  # the same in whole rows
+        phase, along, down = -phase, -along, 1 - down
+    return LampWave(size, u[0], (along + 0.5) % 1.0 - 0.5, u[1], down, u[2], phase)
 
 
 def lamp_estimates(found: Sequence[FrameSequence], refused: Sequence[str], seen: Observations) -> Estimates:
     """``depth_rel`` and ``frequency_hz`` of a lamp, from all sequences; or the reasons."""
     from scipy.special import stdtrit
 
-    lit = [s for s in found if s.wave is not None]
     if not found:
         return replace(Estimates.empty(), reasons={"depth_rel": refused[0] if refused else "no sequence"})
+    lit = [s for s in found if s.wave is not None and not _is_of_fields(s.wave)]
     if not lit:
-        return _limit_of(found)
+        woven = any(s.wave is not None for s in found)
+        return replace(Estimates.empty(), reasons={"depth_rel": WOVEN}) if woven else _limit_of(found)
     best = min(lit, key=lambda s: s.wave.u_amplitude_rel / s.wave.amplitude_rel if s.wave is not None else np.inf)
     wave = best.wave
     assert wave is not None
@@ -222,6 +227,11 @@ def lamp_estimates(found: Sequence[FrameSequence], refused: Sequence[str], seen:
     return Estimates(("depth_rel", "frequency_hz"), values, covariance, dof, ("1", "Hz"), METHOD, tuple(confounders), reasons=reasons)
 
 
+def _is_of_fields(wave: LampWave) -> bool:
+    """Whether a wave goes up and down from row to row, as two fields do that saw different light."""
+    return 0.5 - wave.per_row < 4 * wave.u_per_row + 1e-4
+
+
 def _limit_of(found: Sequence[FrameSequence]) -> Estimates:
     """Limit of the depth of a lamp on the mains that shows nothing in the frames, of the sequence that tells it best."""
     limits = []
@@ -229,16 +239,19 @@ def _limit_of(found: Sequence[FrameSequence]) -> Estimates:
         if s.exposure_s <= 0:
             continue
         left = min(abs(float(np.sinc(f * s.exposure_s))) for f in MAINS_HZ)
-        beat = s.interval_s > 0 and any(abs((f * s.interval_s + 0.5) % 1.0 - 0.5) * len(s.gain_rel) < 1 for f in MAINS_HZ)
+        beat = any(abs((f * s.interval_s + 0.5) % 1.0 - 0.5) * len(s.gain_rel) < 1 for f in MAINS_HZ)  # so without an interval, too
         if left < 10 * LEAST_SINC or beat:
             continue
         swing = float(np.std(np.log(s.gain_rel) - np.log(s.fitted_rel)))
         limits.append((2 * np.sqrt(np.log(len(s.gain_rel) / 2 / 1e-3) / len(s.gain_rel)) * swing * (1 + ONE_SIDED_95 / 5) / left, swing))
     if not limits:
-        exposed = [s.exposure_s for s in found if s.exposure_s > 0]
-        hidden = (
-            "the exposure holds whole periods of the mains, or frames beat with it slowly" if exposed else "its exposure time is not said"
-        )
+        timed = [s for s in found if s.exposure_s > 0]
+        if not timed:
+            hidden = "their exposure time is not said (exposure_s)"
+        elif all(s.interval_s <= 0 for s in timed):
+            hidden = "the time from frame to frame is not said (interval_s), and may hold whole periods of a lamp"
+        else:
+            hidden = "the exposure holds whole periods of the mains, or frames beat with it slowly"
         reason = f"no wave is seen in the light of the frames, but {hidden}: flicker is not told"
         return replace(Estimates.empty(), reasons={"depth_rel": reason})
     limit, swing = min(limits)

@@ -27,6 +27,8 @@ LEAST_KAPPA = 0.02  # a loop that is slower takes hundreds of frames to settle
 FOUND = 3.5  # u from which a loop counts as found
 KNOWN_SHARE = 0.15  # u of the gain's share in the changes, up to which gain and exposure are told apart
 MOST_CLIPPED = 1e-3  # share of a frame's pixels
+LEAST_LIGHT = 0.02  # of a frame over the median of all
+MOST_PAUSE = 100  # frame times, after which another sequence begins
 MOST_ROUNDS = 40  # of factors and bands in turn
 MOVES = 5.0  # u beyond which gains, and the black, are said to move
 BLACK_CHANCE = 1e-4
@@ -46,6 +48,7 @@ class SequenceSums:
     pixels: dict[int, np.ndarray] = field(default_factory=dict)
     means: dict[int, float] = field(default_factory=dict)
     codes: dict[int, tuple[int, float, float]] = field(default_factory=dict)  # highest code, shares of pixels there and at 0
+    bits: int = 0  # all that are set in any code
 
     def add(self, frame: np.ndarray, index: int) -> None:
         """Add the frame of this index."""
@@ -59,6 +62,14 @@ class SequenceSums:
         self.means[index] = float(frame.mean(dtype=float))
         top = int(frame.max())
         self.codes[index] = (top, float(np.mean(frame == top)), float(np.mean(frame == 0)))
+        self.bits |= int(np.bitwise_or.reduce(frame, axis=None))
+
+    def top(self, bits: int) -> int:
+        """The code at which the scale ends: below 2^bits − 1 where codes are shifted to the left, or where the converter has fewer bits."""
+        step = self.bits & -self.bits or 1
+        highest = max(code for code, _, _ in self.codes.values())
+        full = max(share for code, share, _ in self.codes.values() if code == highest) > MOST_CLIPPED
+        return highest if full and (highest + step) & (highest + step - 1) == 0 else 2**bits - step
 
 
 def block_px(side: int) -> int:
@@ -77,11 +88,12 @@ def reduce_sequences(groups: Sequence[PictureGroup], seen: Observations) -> Obse
     """Follow gain and black of every sequence, and fit loop and lamp to them."""
     dark = dark_level(seen)
     found, refused = [], []
-    for number, group in enumerate(groups, start=1):
+    stretches = [(group, order) for group in groups for order in _stretches(group)]
+    for number, (group, order) in enumerate(stretches, start=1):
         try:
-            found.append(sequence_of(group, dark))
+            found.append(sequence_of(group, dark, order))
         except MeasureError as problem:
-            refused.append(f"sequence {number} of {len(groups)}: {problem.what}" + (f" ({problem.remedy})" if problem.remedy else ""))
+            refused.append(f"sequence {number} of {len(stretches)}: {problem.what}" + (f" ({problem.remedy})" if problem.remedy else ""))
     loop = loop_of_all(found, refused, seen)
     lamp = lamp_estimates(found, refused, seen)
     sequences = FrameSequences(tuple(found), tuple(refused), loop, lamp)
@@ -91,14 +103,18 @@ def reduce_sequences(groups: Sequence[PictureGroup], seen: Observations) -> Obse
 
 
 def dark_level(seen: Observations) -> tuple[float, float] | None:
-    """Level of the dark frames and its u; None without them."""
+    """Level of the dark frames and its u, which holds that noise below 0 is cut off; None without them."""
     fit, transfer = seen.photon_transfer_fit, seen.photon_transfer
+    clipped = 0.0
+    if seen.histogram is not None and seen.histogram.dark_counts.any():
+        clipped = float(seen.histogram.dark_counts[0] / seen.histogram.dark_counts.sum())
     if fit is not None and "offset_dn" in fit:
-        return fit["offset_dn"].value, fit["offset_dn"].u
-    if transfer is None or not transfer.dark.mean_dn.size:
+        level, u = fit["offset_dn"].value, fit["offset_dn"].u
+    elif transfer is None or not transfer.dark.mean_dn.size:
         return None
-    levels = transfer.dark.mean_dn
-    return float(levels.mean()), float(max(np.ptp(levels), 0.05))
+    else:
+        level, u = float(transfer.dark.mean_dn.mean()), float(max(np.ptp(transfer.dark.mean_dn), 0.05))
+    return level, float(np.hypot(u, 2 * clipped * max(level, 1.0)))
 
 
 @dataclass(frozen=True)
@@ -110,29 +126,42 @@ class _Factors:
     covariance: np.ndarray
 
 
-def sequence_of(group: PictureGroup, dark: tuple[float, float] | None) -> FrameSequence:
-    """What one sequence tells.
+def _stretches(group: PictureGroup) -> list[np.ndarray]:
+    """Frames, by their index, between long pauses."""
+    assert isinstance(group.sums, SequenceSums)
+    order, times = np.arange(len(group.sums.means)), group.facts.times_s
+    if times is None or len(times) < 2:
+        return [order]
+    steps = np.diff(times)
+    return np.split(order, np.flatnonzero(steps > MOST_PAUSE * np.median(steps)) + 1)
+
+
+def sequence_of(group: PictureGroup, dark: tuple[float, float] | None, order: np.ndarray) -> FrameSequence:
+    """What the frames of one sequence tell, given by their index in the group.
 
     Raises
     ------
     MeasureError
         If it has too few frames, or too little of the scene stays as it is.
     """
-    sums, top = group.sums, 2**group.bits - 1
+    sums = group.sums
     assert isinstance(sums, SequenceSums)
-    count = len(sums.means)
-    if count < LEAST_FRAMES:
-        raise MeasureError(f"{count} frames, {LEAST_FRAMES} are needed", remedy=f"take {LEAST_FRAMES - count} frames more")
-    order = range(count)
-    levels = np.array([sums.means[i] for i in order])
+    top, given = sums.top(group.bits), order
+    if len(given) < LEAST_FRAMES:
+        raise MeasureError(f"{len(given)} frames, {LEAST_FRAMES} are needed", remedy=f"take {LEAST_FRAMES - len(given)} frames more")
+    levels = np.array([sums.means[i] for i in given])
     if dark is not None and levels.max() - dark[0] < max(10 * dark[1], 3.0, 0.005 * top):
         raise MeasureError("the frames show no light", remedy="dark frames in a row belong into a group of kind dark")
+    inside = np.array([(sums.highest[i] < top) & (sums.lowest[i] > 0) for i in given]).reshape(len(given), -1)
+    order = given[(inside.mean(axis=1) >= LEAST_STATIC) & _shows_light(levels, np.array([sums.blocks[i].std() for i in given]), dark)]
+    count = len(order)
+    usable = np.asarray(inside[np.isin(given, order)].all(axis=0))
+    if count < LEAST_FRAMES or usable.mean() < LEAST_STATIC:
+        what = "nearly all of the frame is clipped at an end of the scale, or dark, in some frames"
+        raise MeasureError(what, remedy="take less light, or raise the black level")
+    levels = np.array([sums.means[i] for i in order])
     blocks = np.array([sums.blocks[i] for i in order]).reshape(count, -1)
-    usable = ~(np.any([sums.highest[i] >= top for i in order], axis=0) | np.any([sums.lowest[i] <= 0 for i in order], axis=0)).ravel()
-    if usable.mean() < LEAST_STATIC:
-        remedy = "take less light, or raise the black level"
-        raise MeasureError("nearly all of the frame is clipped at an end of the scale in some frame", remedy=remedy)
-    place, gaps, interval = _places(group, count)
+    place, gaps, interval = _places(group, order)
     row_means = np.array([sums.rows[i] for i in order])
     bands = _bands(row_means, blocks, usable, sums.blocks[0].shape, place, dark)
     if bands is not None and dark is not None:
@@ -145,6 +174,8 @@ def sequence_of(group: PictureGroup, dark: tuple[float, float] | None) -> FrameS
     free = _factors(blocks, static)
     black, moves = _black_of(free)
     notes = []
+    if count < len(given):
+        notes.append(f"{len(given) - count} of {len(given)} frames are left out: they show no light, or are clipped nearly everywhere")
     if black is not None and dark is not None and abs(black[0] - dark[0]) > 4 * np.hypot(black[1], dark[1]) + 0.5:
         both = f"black is {black[0]:.2f} DN in the sequence and {dark[0]:.2f} DN in the dark frames"
         notes.append(f"{both}: the black level follows the scene")
@@ -156,8 +187,9 @@ def sequence_of(group: PictureGroup, dark: tuple[float, float] | None) -> FrameS
     factors = free if moves or black is None else _factors(blocks, static, black[0])
     if not moves and black is not None and float(np.median(factors.covariance[:, 0, 0])) > 1e-4:
         raise MeasureError("the frames are too dark, or too noisy, to follow their gain", remedy="take more light")
-    full = [sums.codes[i][1] if sums.codes[i][0] >= top else 0.0 for i in order]
-    unknown = [k for k in range(count - 1) if full[k] > MOST_CLIPPED or sums.codes[k][2] > MOST_CLIPPED]
+    codes = [sums.codes[i] for i in order]
+    full = [share if code >= top else 0.0 for code, share, _ in codes]
+    unknown = [k for k in range(count - 1) if full[k] > MOST_CLIPPED or codes[k][2] > MOST_CLIPPED]
     told = _black_or_bound(black, blocks, static)
     fit = _loop_fit(factors, levels, told[0], place, (*gaps, *unknown))
     scene = (levels - told[0]) / factors.gain
@@ -165,6 +197,9 @@ def sequence_of(group: PictureGroup, dark: tuple[float, float] | None) -> FrameS
     if bands is not None:
         sampled = np.arange(row_means.shape[1])[sample_places(group.moments.shape)[0]]
         pixels = told[0] + (pixels - told[0]) / bands.light(place, sampled)[:, :, None]
+    if missing := [k for k in fit.gaps if k not in unknown and k >= fit.delay - 1]:
+        after = ", ".join(str(order[k] + 1) for k in missing)
+        notes.append(f"frames are missing after frame {after}: the loop is not followed over these steps")
     share, u_share, noise_gain = gain_share(pixels.reshape(count, -1), factors, np.exp(fit.lamp), told[0])
     changes = _changes(scene)
     moved = _fit_of_moved_black(factors, blocks, static, levels, told, place, (*gaps, *unknown), fit, fixed=factors is not free)
@@ -328,16 +363,23 @@ def _black_or_bound(black: tuple[float, float] | None, blocks: np.ndarray, stati
     return 0.5 * darkest, 0.5 * darkest
 
 
-def _places(group: PictureGroup, count: int) -> tuple[np.ndarray, list[int], float]:
+def _shows_light(levels: np.ndarray, contrasts: np.ndarray, dark: tuple[float, float] | None) -> np.ndarray:
+    """Which frames show the scene: by their light, where black is known, and by the contrast of their blocks."""
+    light = levels - (0.0 if dark is None else dark[0])
+    lit: np.ndarray = (light > LEAST_LIGHT * np.median(light)) & (contrasts >= LEAST_LIGHT * np.median(contrasts))
+    return lit
+
+
+def _places(group: PictureGroup, order: np.ndarray) -> tuple[np.ndarray, list[int], float]:
     """When frames were taken, in frame times; steps over which frames are missing; time of a frame, 0 where it was not said."""
-    times = group.facts.times_s
-    if times is None:
-        return np.arange(count, dtype=float), [], group.facts.interval_s or 0.0
-    steps = np.diff(times)
-    if (steps <= 0).any():
-        raise MeasureError("the times of the frames do not rise", remedy=NO_ORDER)
-    interval = float(np.median(steps))
-    return (np.array(times) - times[0]) / interval, np.flatnonzero(steps > 1.5 * interval).tolist(), interval
+    place, interval = (order - order[0]).astype(float), group.facts.interval_s or 0.0
+    if group.facts.times_s is not None:
+        times = np.array(group.facts.times_s)
+        if (np.diff(times) <= 0).any():
+            raise MeasureError("the times of the frames do not rise", remedy=NO_ORDER)
+        interval = float(np.median(np.diff(times[order])))
+        place = (times[order] - times[order[0]]) / interval
+    return place, np.flatnonzero(np.diff(place) > 1.5).tolist(), interval
 
 
 def _loop_fit(factors: _Factors, levels: np.ndarray, black: float, place: np.ndarray, free: tuple[int, ...]) -> LoopFit:
@@ -381,7 +423,7 @@ def _wave_of(fit: LoopFit) -> LampWave | None:
 def _changes(scene: np.ndarray) -> int:
     """How often the scene goes through the middle of its range, by a quarter of it at least."""
     low, high = np.percentile(scene, [5, 95])
-    if high - low < LEAST_CHANGE * scene.mean():
+    if not high - low > LEAST_CHANGE * abs(scene.mean()):
         return 0
     state, changes = 0, 0
     for value in ((scene - low) / (high - low)).tolist():
@@ -400,9 +442,8 @@ def gain_share(pixels: np.ndarray, factors: _Factors, lamp: np.ndarray, black: f
     from scipy.optimize import least_squares
 
     not_told = (0.0, float("inf"), None)
-    own = (factors.gain / lamp)[:, None]
-    spread = float(np.log(np.maximum(own, 1e-6)).std())
-    if spread < 0.03:
+    own = np.maximum(factors.gain / lamp, 1e-6)[:, None]
+    if float(np.log(own).std()) < 0.03:
         return not_told
     count, g = len(pixels), factors.gain[:, None]
     mean = (g * (pixels - factors.offset[:, None])).sum(axis=0) / float((g * g).sum())
@@ -462,8 +503,6 @@ def loop_estimates(
     at = {n: i for i, n in enumerate(fit.names)}
     kappa, u_kappa = fit["kappa"], float(np.sqrt(covariance[at["kappa"], at["kappa"]]))
     reasons, notes = {}, []
-    if fit.gaps and (missing := [k for k in fit.gaps if k not in unknown and k >= fit.delay - 1]):
-        notes.append(f"frames are missing after frame {', '.join(str(k + 1) for k in missing)}: the loop is not followed over these steps")
     if len(unknown):
         notes.append(f"{len(unknown)} frames are clipped in part: what they ask of the gain is not known, and is not used")
     still = kappa < max(FOUND * u_kappa, LEAST_KAPPA)
@@ -547,7 +586,7 @@ def loop_of_all(found: Sequence[FrameSequence], refused: Sequence[str], seen: Ob
         kappa = exposed.loop["kappa"]
         why = f"{both}: by the noise, {share} of the change in decibels is gain (the loop's κ is {kappa.value:.3f} ± {kappa.u:.3f})"
         return replace(Estimates.empty(), reasons={"kappa": why})
-    value, covariance, dof, reasons = _weighted_mean([s.loop.select(("kappa", "target_dn")) for s in moving])
+    value, covariance, dof, reasons = mean_of_loops([s.loop for s in moving])
     if value[0] > 1:
         return replace(Estimates.empty(), reasons={"kappa": f"the loop overshoots, κ = {value[0]:.3g}: the source describes 0 to 1"})
     confounders = tuple(dict.fromkeys(c for s in moving for c in s.loop.confounders))
@@ -555,19 +594,29 @@ def loop_of_all(found: Sequence[FrameSequence], refused: Sequence[str], seen: Ob
     return joint.join(_limits_db(moving, seen))
 
 
-def _weighted_mean(parts: Sequence[Estimates]) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, str]]:
-    """Values by their inverse covariances; widened, with a reason, where they differ by more than that (Birge's ratio)."""
+def mean_of_loops(parts: Sequence[Estimates]) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, str]]:
+    """κ and target by their inverse covariances; widened, with a reason, where they differ by more than that (Birge's ratio).
+
+    What black adds to their errors is the same in all sequences, and no mean makes it smaller.
+    """
     from scipy.special import chdtrc
 
-    inverses = [np.linalg.inv(p.covariance) for p in parts]
-    covariance = np.linalg.inv(sum(inverses))
-    value = covariance @ sum(i @ p.values for i, p in zip(inverses, parts, strict=True))
-    chi2 = float(sum((p.values - value) @ i @ (p.values - value) for i, p in zip(inverses, parts, strict=True)))
-    free, reasons = len(value) * (len(parts) - 1), {}
+    names = ("kappa", "target_dn")
+    told = [p.select((*names, "black_dn")).covariance for p in parts]
+    values, common = [p.select(names).values for p in parts], [c[:2, 2] / max(float(np.sqrt(c[2, 2])), 1e-300) for c in told]
+    inverses = [np.linalg.inv(c[:2, :2]) for c in told]
+    mean = np.linalg.inv(sum(inverses))
+    value = mean @ sum(i @ v for i, v in zip(inverses, values, strict=True))
+    chi2 = float(sum((v - value) @ i @ (v - value) for i, v in zip(inverses, values, strict=True)))
+    free, reasons, widened = 2 * (len(parts) - 1), {}, 1.0
     if free and chdtrc(free, chi2) < 1e-3:
-        covariance = covariance * chi2 / free
-        reasons = {name: f"{len(parts)} sequences differ by more than their u: u holds that" for name in parts[0].names}
-    return value, covariance, np.sum([p.dof for p in parts], axis=0), reasons
+        widened = chi2 / free
+        reasons = dict.fromkeys(names, f"{len(parts)} sequences differ by more than their u: u holds that")
+    each = [mean @ i for i in inverses]
+    own = sum(w @ (c[:2, :2] - np.outer(b, b)) @ w.T for w, c, b in zip(each, told, common, strict=True))
+    shared = sum(w @ b for w, b in zip(each, common, strict=True))
+    dof = np.sum([p.select(names).dof for p in parts], axis=0)
+    return value, widened * (own + np.outer(shared, shared)), dof, reasons
 
 
 def _limits_db(moving: Sequence[FrameSequence], seen: Observations) -> Estimates:
