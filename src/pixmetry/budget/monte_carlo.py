@@ -37,7 +37,7 @@ from pixmetry.locate.estimator import Estimator
 Pair = tuple[np.ndarray, np.ndarray]  # x and y
 UNIT_STRIDE = 1_000_003  # between the unit seeds of cameras of one type
 MOSAIC = "sensor.bayer_mosaic"
-FILLS = ("sensor.blooming", "sensor.full_well")  # do nothing until a pixel is full
+OF_COLOURS = ("sensor.blooming", "sensor.full_well", "processing.sharpening")  # what they do, they do otherwise behind a mosaic
 SHAPES_PICTURE = (  # without noise of their own; a target that they have changed answers otherwise to whatever else acts on it
     "optics.olpf",
     "optics.point_spread",
@@ -356,8 +356,11 @@ def helpers_of(camera: Camera, names: Iterable[str]) -> tuple[str, ...]:
 
 
 def hangs_on_colours(source: Source, camera: Camera) -> bool:
-    """Whether a closed form, which sees a grey target, misses what a source does: under a mosaic pixels of one colour are full first."""
-    return source.id in FILLS and any(e.source.id == MOSAIC for e in camera.active)
+    """Whether a closed form, which sees a grey target, misses what a source does behind a mosaic.
+
+    There pixels of one colour are full first, and what interpolation leaves of the pattern is sharpened.
+    """
+    return source.id in OF_COLOURS and any(e.source.id == MOSAIC for e in camera.active)
 
 
 def shapes_line(element: Element, camera: Camera) -> bool:

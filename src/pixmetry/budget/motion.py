@@ -74,7 +74,7 @@ def lag_contribution(element: Element, setting: Setting, estimator: Estimator) -
     count = GHOSTS if share >= 1 else int(np.clip(np.log(SMALLEST_GHOST) / np.log(share) if share else 0, 0, GHOSTS - 1)) + 1
     ago_s = setting.frame_period_s * np.arange(count)
     behind = np.outer(setting.velocity_px_per_s, ago_s) - 0.5 * np.outer(setting.acceleration_px_per_s2, ago_s**2)
-    shown = (1 - share) * share ** np.arange(count)
+    shown: Any = (1 - share) * share ** np.arange(count)
     shown[-1] = 1 - shown[:-1].sum()
 
     def ghosts(target: Target, facts: Facts, x_px: np.ndarray, y_px: np.ndarray) -> Discs:

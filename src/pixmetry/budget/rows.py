@@ -147,7 +147,7 @@ def _with_formula(row: BudgetRow, source: Source, known: Known, probes: Probes) 
     if source.propagate is None:
         return replace(row, reason=source.reasons["propagate"])
     if hangs_on_colours(source, known.camera):
-        return replace(row, reason="simulated: behind a mosaic, pixels of one colour are full first")
+        return replace(row, reason="simulated: a closed form does not see the mosaic")
     probe, params = probes.of(row.name, source), known.parameters_of(row)
     if row.status == "accepted":
         probe = replace(probe, frame_shape=known.sensor_shape) if known.sensor_shape != known.camera.frame_shape else probe
