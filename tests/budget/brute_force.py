@@ -578,7 +578,8 @@ def verdict_of(table: Table, brute: BruteForce, element: Element, sigmas: float)
     row = table._computed(blank, element, in_camera)
     before = row.before or Parts()
     said_u = Parts(NOTHING, before.smooth_px, before.place_px, before.time_px).axes_px()
-    bias, less = before.constant_px, 0.0
+    bias: tuple[float, float] = before.constant_px
+    less: Any = 0.0
     if row.method == MAP:
         state = table.setting.calibrated if source.gum_class == "G" else table.setting.camera
         less = table._difference(table._with_and_without(state, element, in_camera))[:, 0].reshape(brute.at.shape)
@@ -590,8 +591,10 @@ def verdict_of(table: Table, brute: BruteForce, element: Element, sigmas: float)
     for name, u, b, axis in zip("xy", said_u, bias, (seen.x, seen.y), strict=True):
         if row.method == MAP:  # target by target: nothing but what the row declares may be left
             room = max(row.model_error * float(np.hypot(u, b)), row.floor_px)
-            wrong += [f"bias_{name}"] * (not abs(axis.bias) <= room + sigmas * axis.se_bias)
-            wrong += [f"u_{name}"] * (not axis.u_within(sigmas)[0] <= room)
+            k = "xy".index(name)
+            other = b - float(less[k].mean())  # by the samples, which are not where a map takes the target
+            wrong += [f"bias_{name}"] * (not abs(axis.bias - other) <= room + sigmas * axis.se_bias)
+            wrong += [f"u_{name}"] * (not axis.u_within(sigmas)[0] <= room + before.place_px[k])
             continue
         # few targets may show less scatter than there is, and then they show less of its error too
         low, high = axis.u_within(sigmas, u**2 * np.sqrt((row.kurtosis - 1) / seen.targets))

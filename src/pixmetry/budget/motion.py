@@ -23,7 +23,8 @@ from pixmetry.scene.discs import Discs
 
 FRAMES = 256  # for what is drawn anew in every frame
 PULSES = "sensor.light_pulses"
-LOOKS = ("sensor.exposure", "sensor.interlace", PULSES, "sensor.rolling_shutter", "sensor.trigger_jitter")
+FIELDS = "sensor.interlace"
+LOOKS = ("sensor.exposure", FIELDS, PULSES, "sensor.rolling_shutter", "sensor.trigger_jitter")
 LAGS = {"sensor.image_lag": "lag_rel", "processing.temporal_noise_reduction": "alpha"}  # with the share of the frame before
 OF_MOTION = (*LOOKS, *LAGS)
 LAG_PHASES, LAG_PLACES = 3, 48  # places within the pixel along each axis; places all over the frame
@@ -56,8 +57,10 @@ def motion_contribution(element: Element, setting: Setting, camera: Camera) -> C
     mean = shift.mean(axis=(1, 2))
     time = shift.mean(axis=2).std(axis=1)
     smooth = shift.mean(axis=1).std(axis=1)
-    # rows of two fields show a target twice, and what is found of such a comb hangs on its place in the pixel
-    comb = COMB_REL * float(np.hypot(*v)) * float(np.abs(np.diff(delay, axis=1)).max(initial=0.0))
+    # rows of two fields show a target twice, whatever this source does, and what is found of such a comb hangs on its place in the pixel
+    fields = [row_delays(e, camera)[0] for e in camera.active if e.source.id == FIELDS and e.name != element.name]
+    apart_s = max(float(np.abs(np.diff(d, axis=1)).max(initial=0.0)) for d in (delay, *fields))
+    comb = COMB_REL * float(np.hypot(*v)) * apart_s
     return _of(mean, time, smooth, "times at which the rows look, and the target's speed", floor_px=max(FLOOR_PX, comb))
 
 

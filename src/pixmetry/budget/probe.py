@@ -304,10 +304,16 @@ def curve_of(camera: Camera, saturation_dn: float) -> Curve | None:
     return Curve(of, slope, float(np.interp(saturation_dn, of(levels), levels)))
 
 
+class _AtRest(Discs):
+    """Discs, one a frame, that rest while they are seen: what looks at several times needs to look once."""
+
+    moving = False
+
+
 def scene_of(target: Target, facts: Facts, x_px: np.ndarray, y_px: np.ndarray) -> Discs:
     """One target a frame: frame k has its centre at ``(x_px[k], y_px[k])``."""
     scale = facts.saturation_dn / facts.dn_per_photon
-    return Discs(
+    return _AtRest(
         x_px=np.asarray(x_px, float)[:, None],
         y_px=np.asarray(y_px, float)[:, None],
         diameter_px=target.diameter_px,

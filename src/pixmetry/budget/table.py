@@ -263,7 +263,7 @@ class Table:
             if source.id not in there and (only is None or source.id in only):
                 usual = Element(source.id, source, self._own(source, self._usual(source)))
                 rows.append(self.row(usual if source.id in self.setting.brought_in else off.get(source.id, usual), in_camera=False))
-        return rows
+        return _told_apart(rows)
 
     # ---- one row --------------------------------------------------------------------------------------------------------------
 
@@ -408,7 +408,8 @@ class Table:
         if moved is not None:
             before, after, seen = moved
             row = replace(row, before=before, after=after, how=FIELD, method=DRAWN_ANEW if seen is None else MAP, fields_px=seen)
-            return replace(row, model_error=FIELD_ERROR, floor_px=FIELD_FLOOR_PX)
+            row = replace(row, model_error=FIELD_ERROR, floor_px=FIELD_FLOOR_PX)
+            return self._sampled_anew(row, element) if self._has_other_samples(element, in_camera) else row
         if source.propagate is None and (source.forward is None or source.essential and source.ideal is None):
             return replace(row, before=Parts(), after=Parts(), reason=source.reasons["propagate"])
         try:
@@ -420,6 +421,24 @@ class Table:
         except PixmetryError as problem:
             return replace(row, reason=f"not computed: {problem}")
         return self._with(replace(row, how=how), found, "no target is found behind it")
+
+    def _has_other_samples(self, element: Element, in_camera: bool) -> bool:
+        """Whether the samples of a row lie at other distances by this source."""
+        steps = [np.diff(c.layout([0.0, 1.0], [0.0, 1.0]), axis=1) for c in self._with_and_without(self.setting.camera, element, in_camera)]
+        return not np.allclose(steps[0], steps[1])
+
+    def _sampled_anew(self, row: SourceRow, element: Element) -> SourceRow:
+        """The row of a map with what other samples make of the target itself: an error that hangs on its place among them."""
+        assert row.before is not None and row.after is not None
+        try:
+            found = self._simulated(element)
+        except PixmetryError:
+            return row
+        if found is None:
+            return row
+        u = found.u_px
+        x, y = (a + b for a, b in zip(row.before.constant_px, found.bias_px, strict=True))
+        return replace(row, before=replace(row.before, constant_px=(x, y), place_px=u), after=replace(row.after, place_px=u))
 
     def _with_uncertainty(self, row: SourceRow, element: Element, in_camera: bool, estimates: Estimates) -> SourceRow:
         """The row with what the uncertainty of its measured parameters does to it."""
@@ -548,6 +567,12 @@ class Table:
 
     def _simulated(self, element: Element) -> Contribution | None:
         return self._trials.alone(element).contribution(element.source.gum_class)
+
+
+def _told_apart(rows: list[SourceRow]) -> list[SourceRow]:
+    """The rows, with the name in the chain behind the title of a source that stands in it twice."""
+    titles = [r.title for r in rows]
+    return [replace(r, title=f"{r.title} ({r.name})") if titles.count(r.title) > 1 and r.name != r.source_id else r for r in rows]
 
 
 def _relative_u(element: Element, name: str) -> float:

@@ -177,6 +177,9 @@ def print_budgets(found: BudgetComparison, console: Console, everything: bool = 
         shares = ["" if isnan(row.shares[k]) else f"{percent(row.shares[k])} %" for k in order[1:]]
         table.add_row(escape(row.title), *(significant(scale * row.sizes[k], 2) for k in order), *shares)
     console.print(table)
+    if any(not isnan(row.shares[k]) for row in found.rows for k in order[1:]):
+        words = "share: of the difference of the squares from the best one; negative where the best one has more of it"
+        console.print(words, markup=False, soft_wrap=True)
     for key, values in settings_of(found):
         console.print(f"not the same: {key}: {', '.join(values[k] for k in order)}", markup=False, soft_wrap=True)
 
