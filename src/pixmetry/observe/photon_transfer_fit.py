@@ -62,7 +62,8 @@ CONFOUNDERS = (
     "non-linearity: a lamp whose light is not proportional to exposure looks like a non-linear camera",
     "dark noise: includes the shot noise of dark current that does not grow with exposure",
     "black level: of stored values; where the converter's codes differ in width, the level in front of it is another",
-    "row noise: mains flicker under a rolling shutter looks like row noise in bright frames; dark frames are used here",
+    "row noise: mains flicker under a rolling shutter looks like row noise in bright frames; dark frames are used here; "
+    "slow noise (1/f) of the output amplifier is mostly in it",
 )
 UNDAMPED = 8  # iterations before the variance components move by half steps
 LACK_OF_FIT_Z = 3.0902323  # normal quantile of a false alarm of 0.1 %
