@@ -554,6 +554,22 @@ FAULTS = (
         "shear = motion.values[:, at] * [1.0, 1.0]",
         "tests/series/test_motion.py",
     ),
+    Fault(
+        "f-number from the size of the grains",
+        '"f_number": (1e3 * pitch_um / wavelength_nm, "1")',
+        '"f_number": (0.8e3 * pitch_um / wavelength_nm, "1")',
+        "tests/observe/test_laser_spots.py",
+    ),
+    Fault("grains of a round pupil", "(2 * j1(safe) / safe) ** 2", "np.abs(2 * j1(safe) / safe)", "tests/observe/test_laser_spots.py"),
+    Fault(
+        "offset of a centroid by a slope of the light",
+        'predicted = 0.25 * np.einsum("nij,nj->ni", shape, gradient)',
+        'predicted = 0.2 * np.einsum("nij,nj->ni", shape, gradient)',
+        "tests/series/test_views.py",
+    ),
+    Fault("tilt of a view", "np.degrees(np.arccos(ratio))", "np.degrees(np.arcsin(ratio))", "tests/series/test_views.py"),
+    Fault("focus behind a plate", "pitch_x_um * 1.52 / 0.52", "pitch_x_um * 1.52", "tests/series/test_bands.py"),
+    Fault("light with a filter", "value = level[k] / level[j]", "value = level[j] / level[k]", "tests/series/test_bands.py"),
     Fault("u of the field period without that of the speed", "+ slope**2 * sum(of_speed)", "", "tests/series/test_motion.py"),
     Fault(
         "jitter over half the speed",

@@ -680,7 +680,7 @@ def _notes(w: _Windows, grains: _Grains, left: Array, dof: float) -> list[str]:
     notes = []
     count = len(left)
     if w.left_out:
-        notes.append(f"{w.left_out} frames are left out: they show no such spot, or only a part of it")
+        notes.append(f"frames left out, which show no such spot or only a part of it: {w.left_out}")
     if count < 20:
         notes.append(f"{count} frames tell the scatter to {1 / np.sqrt(2 * dof):.0%}; {WANTED_FRAMES} tell it to 10 %")
     near = float(grains.pattern[1]) if len(grains.pattern) > 1 else 0.0
@@ -697,5 +697,5 @@ def _notes(w: _Windows, grains: _Grains, left: Array, dof: float) -> list[str]:
     share = _clipped_share(w)
     if share > CLIPPED:
         kept = "contrast and size of the grains are those of the pixels that are not"
-        notes.append(f"{share:.0%} of the light is in saturated pixels: {kept}; the scatter is that of a spot that is cut off")
+        notes.append(f"{share:.1%} of the light is in saturated pixels: {kept}; the scatter is that of a spot that is cut off")
     return notes

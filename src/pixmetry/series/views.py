@@ -200,7 +200,8 @@ def _slopes(views: Sequence[View]) -> tuple[Estimates, list[str]]:
         )
     if len(views) < 6:
         notes.append(f"{len(views)} views tell the size of the slopes to {1 / np.sqrt(2 * dof):.0%} at best; 8 or more are better")
-    if variance < 2 * u_variance and variance < 2 * noise / n:
+    of_noise = float(np.sqrt(2 * (noise / n) ** 2 / dof + ((1 - 1 / n) ** 2 * 2 * noise**2 / free if free else 0.0)))
+    if variance < SIGNIFICANT * of_noise:
         limit = float(np.sqrt(max(variance, 0.0) + ONE_SIDED_95 * u_variance))
         row = ("gradient_rel_per_px", limit, u_variance / (2 * limit), dof, "1/px")
         why = {"gradient_rel_per_px": "no slope of the light is seen above the noise; 95 % upper limit"}
