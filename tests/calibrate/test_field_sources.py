@@ -274,3 +274,19 @@ def test_a_digital_camera_has_no_frame_grabber(rng):
         assert ("grabber.clock_warm_up" in drift.text) == grabber and ("sensor.rolling_shutter" in drift.text) == other
         if interface == "digital":
             assert not any("grabber" in f.text + f.advice for f in findings)
+
+
+def test_a_field_that_was_taken_as_exact_untested_lets_nothing_be_named(rng):
+    """The same network with fixed points: with the test of the field (folds) the surface is named, without it is not; nor by 6 images."""
+    simulated = simulate(rng, images=10, points=60, known="fixed")
+    params = a_surface(rng, simulated, 0.0).model_copy(update={"bow_x_um": 5.0, "bow_y_um": -4.0})
+    seen = met_at(predicted(simulated.network, simulated.truth), params) + NOISE_PX * rng.standard_normal((len(simulated.network), 2))
+    network = replace(simulated.network, x_px=seen[:, 0], y_px=seen[:, 1])
+    untested = pixmetry.calibrate(network, options={"folds": 0})
+    assert not untested.tests.field_sources["camera"].height.found
+    assert "test field" in calibrated_geometry(untested).untold["sensor.unflatness"]
+    assert not any("likely" in f.text for f in untested.findings)
+    stated = pixmetry.calibrate(network, options={"folds": 0, "field": "fixed"})
+    assert stated.tests.field_sources["camera"].height.found
+    few = simulate(rng, images=6, points=90)
+    assert not told(rng, few, met_at(predicted(few.network, few.truth), params)).height.found

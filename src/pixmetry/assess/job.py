@@ -215,7 +215,10 @@ def _seen_from(geometry: CameraGeometry, campaign: Campaign) -> CameraGeometry:
     values = lens.values.copy()
     values[lens.index("centre_x_px")] += x0 - (facts.first_col + x)
     values[lens.index("centre_y_px")] += y0 - (facts.first_row + y)
-    return replace(geometry, lens=replace(lens, values=values))
+    whole = dict.fromkeys(
+        geometry.told, "the frames are a window of the calibrated sensor, and what its residuals tell is of the whole frame"
+    )
+    return replace(geometry, lens=replace(lens, values=values), told={}, untold={**geometry.untold, **whole})
 
 
 def _window_of(campaign: Campaign) -> tuple[str, ...]:

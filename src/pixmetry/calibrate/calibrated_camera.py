@@ -266,9 +266,12 @@ def _unflatness(height: HeightMap | None, geometry: CameraGeometry, model: Camer
     if height is None:
         return "lens and poses take up all of a height here; take images rolled by 90 degrees, at several angles"
     if not height.found and height.rivals:
-        return f"other patterns explain its residuals as well: {', '.join(height.rivals)}; two focal lengths tell them apart"
+        return f"something else may explain its residuals as well: {', '.join(height.rivals)}; two focal lengths tell them apart"
     if not height.found and height.gain > STRONG:
-        return "displacements that no height makes are found with it; look at the patterns in the residuals"
+        return (
+            "a height would explain residuals, but displacements that no height makes come with it, other patterns explain more, or the "
+            "images are fewer than 8; look at the patterns in the residuals, and take more images, rolled by 90 degrees"
+        )
     pitch = geometry.lens["pitch_x_um"].value
     aspect = geometry.lens["pitch_y_um"].value / pitch
     distance = geometry.lens["principal_distance_mm"]

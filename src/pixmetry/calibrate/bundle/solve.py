@@ -18,6 +18,7 @@ from pixmetry.core.threads import single_threaded_blas
 __all__ = ["Options", "calibrate_network"]
 DEFAULTS = Options()
 FEW = ("c", "k1")  # estimated first where start values are rough
+UNTESTED_FIELD = "a test field that is not as it is said to be, which was not tested (options: folds, field)"
 SIZED = 1.25  # by which lengths may differ from those of the start poses where these gave the size
 
 
@@ -61,6 +62,8 @@ def calibrate_network(
     settled, field, held, more = _checked_field(settled, options, say)
     say("testing the result")
     tests = replace(_tests(settled, network, options), field=field, hold_out=_with_expected(held, settled))
+    if field is None and options.field != "fixed" and not _is_free(settled.measured):
+        tests = _without_claims(tests)
     if options.residual_grid:
         tests = replace(tests, residual_grid=residual_grids(settled.adjustment))
     findings += [*more, *_findings(settled, tests)]
@@ -217,6 +220,14 @@ def _tests(settled: Settled, given: Network, options: Options) -> Tests:
     if shift.corrected.any() or shift.possible_px:
         tests = replace(tests, eccentricity=EccentricityRecord(int(shift.corrected.sum()), shift.largest_px, shift.possible_px))
     return replace(tests, variance_components=settled.components or None)
+
+
+def _without_claims(tests: Tests) -> Tests:
+    """The tests with no error source named by the residuals: a field that was taken as exact, and was not tested, may bend alike."""
+    from pixmetry.calibrate.checks.field_sources import without_claims
+
+    sources = {name: without_claims(one, UNTESTED_FIELD) for name, one in (tests.field_sources or {}).items()}
+    return replace(tests, field_sources=sources or None, patterns=tuple(replace(p, confirmed=False) for p in tests.patterns or ()))
 
 
 def _findings(settled: Settled, tests: Tests) -> list[Finding]:

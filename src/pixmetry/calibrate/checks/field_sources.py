@@ -32,6 +32,7 @@ CELLS = (10, 8)  # of the frame, in which residuals have something in common or 
 TURNED = 1e-3  # level at which a pattern that turns is no height
 SIDE = (33, 25)  # of the map that is drawn
 FINER = 0.03  # of what a partition explains, which a finer one must explain more: terms are linear
+LEAST_TOLD = 8  # images by which a fixed pattern of the camera is told from errors of single images
 LEAST_IMAGES = 5  # whose scores show their own scatter
 
 
@@ -140,7 +141,8 @@ def _height(camera: _Camera, others: list[Candidate], place: Place | None) -> He
     if few is None or more is None:
         return few
     found = more if more.gain > few.gain + STRONG else few
-    named = bool(place is not None and not place.rivals and found.gain > STRONG and found.p_turned > TURNED)
+    enough = len(np.unique(camera.image)) >= LEAST_TOLD
+    named = bool(enough and place is not None and not place.rivals and found.gain > STRONG and found.p_turned > TURNED)
     return replace(found, found=named, rivals=place.rivals if place is not None else ())
 
 
@@ -371,7 +373,8 @@ def _seams(camera: _Camera, others: list[Candidate], place: Place | None) -> Sea
     layout, fit = best
     gain = fit.gain
     fields = layout[0] * layout[1]
-    named = place is not None and not place.rivals and gain > STRONG
+    enough = len(np.unique(camera.image)) >= LEAST_TOLD
+    named = enough and place is not None and not place.rivals and gain > STRONG
     # steps less their mean, of draws of one standard deviation: their squares over what is told of them
     weight, square = float(np.trace(fit.told @ fit.told.T)), float(fit.values @ fit.values)
     std = float(np.sqrt(max(square - np.trace(fit.covariance), 0.0) / weight))
@@ -455,3 +458,10 @@ def _decaying(scales: ImageScales, y: np.ndarray, weight: np.ndarray, contrasts:
     gain = (chi2 - rest) / max(rest / free, 1.0) - 2 * np.log(dof)
     to_tau = np.diag([1.0, tau])
     return replace(scales, p_left=p_left, gain=gain, start=size, tau_s=tau, covariance=to_tau @ covariance @ to_tau)
+
+
+def without_claims(found: FieldSources, rival: str) -> FieldSources:
+    """The same where something else, in words, may look like each of them: nothing is named."""
+    height = None if found.height is None or not found.height.found else replace(found.height, found=False, rivals=(rival,))
+    seams = None if found.seams is None else replace(found.seams, found=False)
+    return replace(found, height=height or found.height, seams=seams)

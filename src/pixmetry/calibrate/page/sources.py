@@ -57,7 +57,7 @@ def _height_row(height: HeightMap | None, model: CameraModel) -> Row | None:
     if height.rivals:
         text = "Other patterns explain its residuals as well."
     elif height.gain > STRONG:
-        text = "Displacements that no height makes were found with it."
+        text = "A height would explain residuals, but other displacements come with it, or the images are fewer than 8."
     return Row(["Sensor unflatness, rms height", f"at most {significant(limit, 2)}", "", unit], text)
 
 
