@@ -9,8 +9,8 @@ import numpy as np
 
 from pixmetry.calibrate.bundle.model import CameraModel
 from pixmetry.calibrate.checks.causes import STRONG
+from pixmetry.calibrate.checks.quality import p_words
 from pixmetry.calibrate.page.figures import colour_bar, frame, frame_height
-from pixmetry.calibrate.page.text import p_text
 from pixmetry.report import Column, Figure, Row, Section, Table
 from pixmetry.report.drawing import canvas
 from pixmetry.report.numbers import significant
@@ -50,7 +50,7 @@ def _height_row(height: HeightMap | None, model: CameraModel) -> Row | None:
     factor, unit = _unit(model.sensor)
     rms, u = (factor * float(np.sqrt(np.mean(part**2))) for part in (height.height_px, height.u_px))
     if height.found:
-        text = f"{height.rank} shapes are told; displacements of these shapes across the radius: {p_text(height.p_turned)}."
+        text = f"{height.rank} shapes are told; displacements of these shapes across the radius: {p_words(height.p_turned)}."
         return Row(["Sensor unflatness, rms height", significant(rms, 2), significant(u, 2), unit], text)
     limit = float(np.sqrt(rms**2 + (1.645 * u) ** 2))
     text = "No height was found."
@@ -81,7 +81,7 @@ def _scales_row(scales: ImageScales | None, interface: str | None) -> Row | None
         text = f"It decays with a time constant of {significant(scales.tau_s, 2)} ± {significant(u_tau, 2)} s."
         return Row(["x-scale of the first image", significant(1e6 * scales.start, 2), significant(1e6 * u, 2), "ppm"], text + digital)
     spread, u = 1e6 * float(scales.values.std()), 1e6 * float(np.median(scales.u))
-    text = f"The x-scales differ from image to image, {p_text(scales.p_differ)}, and do not decay; u is that of one image."
+    text = f"The x-scales differ from image to image, {p_words(scales.p_differ)}, and do not decay; u is that of one image."
     return Row(["x-scales of the images, standard deviation", significant(spread, 2), significant(u, 2), "ppm"], text + digital)
 
 
