@@ -43,6 +43,9 @@ BY_OTHERS_IN_CHAIN = (  # rows that hang on another source: on the black level, 
     ("grabber.adc", "usual", (ANALOGUE, 28.4, SMALL)),
     ("grabber.clamp", "bound", (ANALOGUE, 28.4, SMALL)),
     ("sensor.smear", "bound", MOSAIC),
+    ("processing.sharpening", "usual", MOSAIC),
+    ("processing.sharpening", "usual", (ANALOGUE, 10.0, SMALL)),
+    ("grabber.sampling_clock", "usual", (ANALOGUE, 10.0, SMALL)),
     ("sensor.image_lag", "bound", ("dcs420_like", None, SMALLEST)),
     *(
         (name, size, FIELD)

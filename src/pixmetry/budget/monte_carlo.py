@@ -37,7 +37,8 @@ from pixmetry.locate.estimator import Estimator
 Pair = tuple[np.ndarray, np.ndarray]  # x and y
 UNIT_STRIDE = 1_000_003  # between the unit seeds of cameras of one type
 MOSAIC = "sensor.bayer_mosaic"
-OF_COLOURS = ("sensor.blooming", "sensor.full_well", "processing.sharpening")  # what they do, they do otherwise behind a mosaic
+FILLS = ("sensor.blooming", "sensor.full_well")  # do nothing until a pixel is full
+SHARPENS = "processing.sharpening"  # the picture as it is: its undershoot, and what is left of a mosaic
 SHAPES_PICTURE = (  # without noise of their own; a target that they have changed answers otherwise to whatever else acts on it
     "optics.olpf",
     "optics.point_spread",
@@ -355,12 +356,13 @@ def helpers_of(camera: Camera, names: Iterable[str]) -> tuple[str, ...]:
     return tuple(h for h in dict.fromkeys(helpers) if h not in names)
 
 
-def hangs_on_colours(source: Source, camera: Camera) -> bool:
-    """Whether a closed form, which sees a grey target, misses what a source does behind a mosaic.
+def hangs_on_picture(source: Source, camera: Camera) -> bool:
+    """Whether a closed form, which sees a grey and sharp target, misses what a source does in this camera.
 
-    There pixels of one colour are full first, and what interpolation leaves of the pattern is sharpened.
+    Under a mosaic pixels of one colour are full first. What is sharpened is the target as lens, line and mosaic leave it.
     """
-    return source.id in OF_COLOURS and any(e.source.id == MOSAIC for e in camera.active)
+    shaping = [e for e in camera.active if e.name in helpers_of(camera, ()) and e.source.id != source.id]
+    return source.id in FILLS and any(e.source.id == MOSAIC for e in shaping) or source.id == SHARPENS and bool(shaping)
 
 
 def shapes_line(element: Element, camera: Camera) -> bool:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from pixmetry.budget.combine import Combined, combine
-from pixmetry.budget.monte_carlo import MonteCarlo, Trials, hangs_on_colours, missed
+from pixmetry.budget.monte_carlo import MonteCarlo, Trials, hangs_on_picture, missed
 from pixmetry.budget.parameters import applies, base_of, u_of_total, with_estimates
 from pixmetry.budget.probe import ESTIMATOR_ITSELF, Probes, perfect
 from pixmetry.budget.records import DECIDED, BudgetRow, Interaction
@@ -146,8 +146,8 @@ def _beyond(source: Source, known: Known) -> str:
 def _with_formula(row: BudgetRow, source: Source, known: Known, probes: Probes) -> BudgetRow:
     if source.propagate is None:
         return replace(row, reason=source.reasons["propagate"])
-    if hangs_on_colours(source, known.camera):
-        return replace(row, reason="simulated: a closed form does not see the mosaic")
+    if hangs_on_picture(source, known.camera):
+        return replace(row, reason="simulated: a closed form does not see what lens, line and mosaic make of the target")
     probe, params = probes.of(row.name, source), known.parameters_of(row)
     if row.status == "accepted":
         probe = replace(probe, frame_shape=known.sensor_shape) if known.sensor_shape != known.camera.frame_shape else probe

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from pixmetry.budget.fields import Calibration, Places, field_of, spread_of
-from pixmetry.budget.monte_carlo import Trials, hangs_on_colours, missed
+from pixmetry.budget.monte_carlo import Trials, hangs_on_picture, missed
 from pixmetry.budget.motion import LAGS, OF_MOTION, PULSES, STILL, held_by_pulses, lag_contribution, motion_contribution, pulse_contribution
 from pixmetry.budget.parameters import UNSTATED, applies, assumed_estimates, u_from_parameters, with_estimates
 from pixmetry.budget.probe import Probes, put
@@ -413,7 +413,7 @@ class Table:
         if source.propagate is None and (source.forward is None or source.essential and source.ideal is None):
             return replace(row, before=Parts(), after=Parts(), reason=source.reasons["propagate"])
         try:
-            if source.propagate is not None and not hangs_on_colours(source, self.setting.camera):
+            if source.propagate is not None and not hangs_on_picture(source, self.setting.camera):
                 how = FORMULA
                 found: Contribution | None = source.propagate(element.params, self.probes.of(element.name, source))
             else:
