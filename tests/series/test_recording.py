@@ -31,7 +31,7 @@ def seen(scene: np.ndarray, count: int, rng: np.random.Generator, noise: float =
     return [np.clip(np.rint(scene + rng.normal(0, noise, scene.shape)), 0, 255).astype(np.uint8) for _ in range(count)]
 
 
-@pytest.mark.parametrize(("codec", "quality", "group"), [("h264", 20, 5), ("h264", 25, 7), ("h264", 22, 1)])
+@pytest.mark.parametrize(("codec", "quality", "group"), [("h264", 23, 5), ("h264", 26, 7), ("h264", 22, 1)])
 def test_the_quantiser_and_the_group_of_a_coder(codec: str, quality: int, group: int, rng: np.random.Generator) -> None:
     pytest.importorskip("av")
     scene = texture(rng)

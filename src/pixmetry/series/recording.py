@@ -36,6 +36,8 @@ U_QUALITY = 1.0  # one coder decides not quite as another
 LEAST_CONTRAST = 30.0  # of the scene's power over that of the noise, at a frequency that is compared
 BANDS = 48  # frequencies along a row
 ALIKE_MISFIT = 1.3  # ratio of sums of squares, below which a staircase and a smooth line are not told apart
+ABOVE_SWITCH = 0.8  # share of the rows that lie above where heads switch
+MODEL_U_REL = 0.02  # of a bandwidth: a staircase that is sampled a little beside the middle of its steps, a filter of another shape
 BLOCKS = 8  # parts of the rows whose scatter is the u of the bandwidth
 LEAST_ROWS = 0.25  # share of the rows that show where they are, for their jitter
 EDGE_PX = 4  # of a row to either side, that are left out
@@ -158,7 +160,7 @@ def _transfer(direct: Array, recorded: Array, noise_dn2: Sequence[float]) -> tup
     frequency = np.array([(a + b - 1) / 2 / cols for a, b in zip(edges[:-1], edges[1:], strict=True)])
     parts = np.full((BLOCKS, BANDS), np.nan)
     # of all rows a delay that is common to them turns the phase by as much per frequency
-    blocks = np.array_split(np.arange(len(direct)), BLOCKS)
+    blocks = np.array_split(np.arange(int(ABOVE_SWITCH * len(direct))), BLOCKS)
     for b, rows in enumerate(blocks):
         for k, (first, end) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
             p = power[rows, first:end].sum(axis=0)
@@ -219,7 +221,7 @@ def _bandwidth(frequency: Array, parts: Array, jitter_px2: float) -> tuple[Estim
     if len(logs) < 3:
         why = "the scene has too little contrast at high frequencies: show sharp edges or texture"
         return _untold(("bandwidth_rel",), why), held
-    value, u = float(np.exp(logs.mean())), float(logs.std(ddof=1) / np.sqrt(len(logs)))
+    value, u = float(np.exp(logs.mean())), float(np.hypot(logs.std(ddof=1) / np.sqrt(len(logs)), MODEL_U_REL))
     if max(way[0] for way in ways) < ALIKE_MISFIT * min(way[0] for way in ways):
         u = float(np.hypot(u, (ways[1][1].mean() - ways[0][1].mean()) / np.sqrt(12)))
     if value * (1 - SIGNIFICANT * u) > 0.5 * 3:
@@ -322,7 +324,7 @@ def _head_switch(step_px: Array) -> Estimates:
     if seen.size < LEAST_ROWS * rows or (seen > rows - 24).sum() < 8:
         return _untold(("head_switch_px",), "the last rows show nothing upright")
     values = step_px[seen]
-    above = values[seen < 0.8 * rows]
+    above = values[seen < ABOVE_SWITCH * rows]
     scatter = 1.4826 * float(np.median(np.abs(above - np.median(above))))
     best, gain = None, 0.0
     for count in range(2, 61):
@@ -348,13 +350,15 @@ def group_of(squares: Array) -> int | None:
 
     The picture coded by itself does not repeat what the others froze: the difference to it is larger, once a group.
     """
-    median = float(np.median(squares))
-    scatter = max(1.4826 * float(np.median(np.abs(squares - median))), 0.01 * median, 1e-9)
-    high = np.flatnonzero(squares > median + JUMP * scatter)
-    if high.size < 2:
-        return None
-    period = int(np.gcd.reduce(np.diff(high)))
-    return period if period > 1 else None
+    above = squares[1:-1] - 0.5 * (squares[:-2] + squares[2:])  # without what freezes more and more within a group
+    for values in (above, squares):
+        median = float(np.median(values))
+        scatter = max(1.4826 * float(np.median(np.abs(values - median))), 0.01 * float(np.median(squares)), 1e-9)
+        high = np.flatnonzero(values > median + JUMP * scatter)
+        period = int(np.gcd.reduce(np.diff(high))) if high.size > 1 else 0
+        if period > 1:
+            return period
+    return None
 
 
 def traces_of(frames: np.ndarray) -> Array:
@@ -378,8 +382,8 @@ def traces_of(frames: np.ndarray) -> Array:
 def cosines(size: int) -> Array:
     """The cosine transform, orthonormal, shape (size, size)."""
     k, i = np.indices((size, size))
-    waves: Array = np.where(k == 0, np.sqrt(1 / size), np.sqrt(2 / size)) * np.cos(np.pi * (2 * i + 1) * k / (2 * size))
-    return waves
+    waves = np.cos(np.pi * (2 * i + 1) * k / (2 * size)) * np.where(k == 0, np.sqrt(1 / size), np.sqrt(2 / size))
+    return np.asarray(waves, float)
 
 
 def _coder(before: np.ndarray, after: np.ndarray, squares: Array, noise: Estimates, correlation: Estimates, depth_bits: int) -> Estimates:
@@ -388,7 +392,8 @@ def _coder(before: np.ndarray, after: np.ndarray, squares: Array, noise: Estimat
     group = group_of(squares)
     was, told_of = traces_of(before), traces_of(after)
     values = 3 * (len(after) - 1) / 2 * after[0].size / BLOCK**2  # of the coarse coefficients
-    tilted = abs(float(np.log(told_of[1] / told_of[2] * was[2] / was[1]))) > max(TILT, JUMP * float(np.sqrt(8 / values)))
+    coarse, fine = np.maximum(np.array([told_of[1:3], was[1:3]]), 1e-6).T
+    tilted = abs(float(np.log(coarse[0] / coarse[1] * fine[1] / fine[0]))) > max(TILT, JUMP * float(np.sqrt(8 / values)))
     lumpy = told_of[3] - was[3] > LUMPY or tilted
     frozen = alike.value > max(SIGNIFICANT * alike.u, FREEZES)
     less = ratio.value < 1 - max(FREEZES, SIGNIFICANT * ratio.u)
@@ -399,7 +404,7 @@ def _coder(before: np.ndarray, after: np.ndarray, squares: Array, noise: Estimat
     if group is None and not frozen:
         group, told = 1, _untold(("group",), "noise does not freeze: each picture is coded by itself, or finely")
     elif group is None:
-        what = f"fewer than two pictures coded by themselves are among the {len(after)} recorded frames: take more of them"
+        what = f"fewer than two pictures coded by themselves stand out among the {len(after)} recorded frames: take more of them"
         told = _untold(("group",), what)
     else:
         told = Estimates.from_rows([("group", float(group), 0.1, np.inf, "1")], method=METHOD)
