@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -53,13 +54,25 @@ def forward(params: Shading, signal: Signal, stream: Stream) -> Signal:
 
 
 def measure(observations: Observations) -> Estimates:
-    """Read gradient at the centre and loss to the corners from the smooth surface through the flat-field stack."""
-    return observations.fitted(
+    """Read gradient at the centre and loss to the corners from the smooth surface through the flat-field stack.
+
+    Smear adds light that is the same in all rows of a column: what changes from row to row was larger before it by 1 + s/t, and half as
+    much more of the loss to the corners, to which rows and columns belong alike.
+    """
+    found = observations.fitted(
         {"gradient_x_per_px": "shading_x_per_px", "gradient_y_per_px": "shading_y_per_px", "corner_rel": "shading_corner_rel"},
         "shading needs a stack of bright frames and one of dark frames of the same exposure",
         where="optics.shading",
         remedy="take at least 16 of each",
     )
+    stack = observations.bright_stack
+    if stack is None or not stack.exposure_s:
+        return found
+    more, u = (v / stack.exposure_s for v in observations.moved_charge("smear_s"))
+    share = np.array([{"gradient_y_per_px": 1.0, "corner_rel": 0.5}.get(name, 0.0) for name in found.names])
+    by_smear, factor = found.values * share * u, 1 + more * share
+    covariance = found.covariance * np.outer(factor, factor) + np.outer(by_smear, by_smear)
+    return replace(found, values=found.values * factor, covariance=covariance)
 
 
 def correct(params: Shading, signal: Signal, maps: Mapping[str, np.ndarray]) -> Signal:
