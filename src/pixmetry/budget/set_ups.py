@@ -65,7 +65,8 @@ SET_UPS = {
         SetUp(
             "edge",
             "Slanted edges",
-            "The chart in sharpest focus, 20 edges or more in the frame; nothing moves.",
+            "The chart in sharpest focus, 20 edges or more in the frame; nothing moves. For the sensor's tilt also at two settings of the "
+            "focus to both sides of it, each a group with focus_um.",
             "White at 70 % of saturation.",
             "lens to 0.015 px, pixel width to 0.05 px",
             (_series("edge", 4),),
