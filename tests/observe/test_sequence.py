@@ -17,6 +17,7 @@ from pixmetry.core.number import Estimates
 from pixmetry.core.progress import no_progress
 from pixmetry.files.images import write_frame
 from pixmetry.files.manifest import load_campaign
+from pixmetry.observe.gain_loop import LoopData, fit_loop
 from pixmetry.observe.sequence import mean_of_loops
 
 ALPHA = 1e-6
@@ -248,3 +249,16 @@ def test_black_that_sequences_share_is_not_averaged_out():
     one = Estimates(("kappa", "target_dn", "black_dn"), np.array([0.3, 700.0, 32.0]), joint, np.full(3, 50.0), ("1", "DN", "DN"))
     _, covariance, _, _ = mean_of_loops([one, one])
     assert covariance[1, 1] == pytest.approx(1.0, rel=1e-3) and covariance[0, 0] == pytest.approx(own[0] ** 2 / 2, rel=1e-2)
+
+
+def test_a_lamp_beside_a_fast_loop_is_found_whatever_wave_the_search_begins_with(rng: np.random.Generator):
+    """Gains of 60 frames, u 2e-4; a lamp of 2.5 % at 0.388 cycles a frame. κ is told to 1e-3 with it, to 0.02 without."""
+    for phase in np.arange(6) / 6:
+        gain, levels = [0.76], []
+        lamp = np.log1p(0.025 * np.cos(2 * np.pi * (0.388 * np.arange(60) + phase)))
+        for k in range(60):
+            levels.append(5.5 + 0.3 * ((k // 8) % 2) + gain[k] + lamp[k])
+            gain.append(gain[k] + 0.543 * (6.01 - levels[k]))
+        log_gain = np.array(gain[:60]) + lamp + 2e-4 * rng.standard_normal(60)
+        found = fit_loop(LoopData(log_gain, np.full(60, 2e-4), np.array(levels), np.arange(60.0)))
+        assert found.has_wave and abs(found["kappa"] - 0.543) < 6 * found.u("kappa") < 0.02

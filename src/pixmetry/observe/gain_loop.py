@@ -252,12 +252,13 @@ def _with_wave(data: LoopData, found: LoopFit) -> LoopFit:
     frames, begin = len(data.u), dict(zip(found.names, found.values.tolist(), strict=True))
     extra = tuple(n for n in found.names if n in ("lowest", "highest"))
     plain = _fit(data, extra, found.delay, found.gaps, begin) if found.has_wave else found
-    if not found.has_wave:
-        left = data.log_gain - found.fitted
-        trial = np.arange(2, 2 * frames) / (4 * frames)  # ½ cycle over the sequence at least, in steps of a quarter of a bin
-        angles = 2 * np.pi * trial[:, None] * data.place
-        per_frame = float(trial[int(np.argmax((np.cos(angles) @ left) ** 2 + (np.sin(angles) @ left) ** 2))])
-        found = _fit(data, (*extra, *WAVE), found.delay, found.gaps, {**begin, "per_frame": per_frame, **_phases_of(data, left, per_frame)})
+    left = data.log_gain - plain.fitted
+    trial = np.arange(2, 2 * frames) / (4 * frames)  # ½ cycle over the sequence at least, in steps of a quarter of a bin
+    power = [abs(np.exp(-2j * np.pi * f * data.place) @ left) for f in trial]
+    start = {**dict(zip(plain.names, plain.values.tolist(), strict=True)), "per_frame": float(trial[int(np.argmax(power))])}
+    start |= _phases_of(data, left, start["per_frame"])
+    searched = _fit(data, (*extra, *WAVE), found.delay, found.gaps, start)
+    found = min(searched, found, key=lambda f: f.chi2) if found.has_wave else searched
     dof = max(frames - len(found.names), 1)
     ratio = (plain.chi2 - found.chi2) / len(WAVE) / max(found.chi2 / dof, 1e-300)
     i = [found.names.index(n) for n in ("cosine", "sine")]
