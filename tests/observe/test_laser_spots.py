@@ -21,7 +21,7 @@ from pixmetry.camera.group_facts import GroupFacts
 from pixmetry.camera.observations import Observations
 from pixmetry.core.progress import no_progress
 from pixmetry.files.in_memory import Frames, campaign_of_arrays
-from pixmetry.observe.laser_spots import find_spot
+from pixmetry.observe.laser_spots import SpotCrops, find_spot
 from pixmetry.scene.picture import Picture
 from pixmetry.scene.speckle import Speckle
 from pixmetry.scene.uniform import Uniform
@@ -168,6 +168,29 @@ def test_frames_that_tell_nothing_say_why(rng: np.random.Generator) -> None:
         seen = observed(recorded(rng, frames))
         assert why in seen.speckle.refused[0] and any(why in note for note in seen.notes)
     assert find_spot(np.zeros((6, 6))) is None
+
+
+def test_spots_without_grains_say_why(rng: np.random.Generator) -> None:
+    """A spot of 1 px is small, not saturated; copies tell nothing; a response that bends makes more contrast than there is."""
+    at = np.indices((SIDE, SIDE)) - (SIDE - 1) / 2
+    small = recorded(rng, np.repeat(np.exp(-2 * np.square(at).sum(axis=0))[None], 12, axis=0))
+    assert "too small" in measure_sources(observed(small))[1]["scene.speckle"]
+    light = patterns(1, 40)
+    assert "same picture" in observed(np.repeat(recorded(rng, light[:1]), 9, axis=0)).speckle.refused[0]
+    assert "at most 1" in measure_sources(observed(recorded(rng, 0.3 * light**1.5)))[1]["scene.speckle"]
+
+
+def test_frames_beyond_the_memory_are_the_last_ones_whatever_the_order(rng: np.random.Generator, monkeypatch) -> None:
+    frames = recorded(rng, patterns(1, 40)[:8])
+    kept = []
+    for order in (range(8), (7, 3, 0, 6, 1, 2, 5, 4)):
+        crops = SpotCrops()
+        monkeypatch.setattr("pixmetry.observe.laser_spots.LARGEST_BYTES", 5 * frames[0].nbytes)
+        for index in order:
+            crops.add(frames[index], index)
+        kept.append(sorted(crops.kept))
+        assert crops.left_out == 8 - len(crops.kept) > 0
+    assert kept[0] == kept[1] == list(range(len(kept[0])))
 
 
 def test_grains_smaller_than_pixels_need_the_f_number(rng: np.random.Generator) -> None:

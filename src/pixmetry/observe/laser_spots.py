@@ -51,6 +51,7 @@ class SpotCrops:
     left_out: int = 0
     shape: tuple[int, int] = (0, 0)
     _bytes: int = 0
+    _end: float = float("inf")  # index from which on frames are left out
 
     def add(self, frame: np.ndarray, index: int) -> None:
         """Add the frame of this index."""
@@ -65,11 +66,15 @@ class SpotCrops:
             (max(int(c - half), 0), min(int(c + half) + 2, size)) for c, size in ((y, frame.shape[0]), (x, frame.shape[1]))
         )
         part = np.array(frame[top:bottom, left:right])
-        if self._bytes + part.nbytes > LARGEST_BYTES:
+        if index >= self._end:
             self.left_out += 1
             return
         self._bytes += part.nbytes
         self.kept[index] = (part, top, left, x, y, radius)
+        while self._bytes > LARGEST_BYTES:  # the last ones go, so that the order in which threads end does not show
+            self._end = max(self.kept)
+            self._bytes -= self.kept.pop(int(self._end))[0].nbytes
+            self.left_out += 1
 
 
 def find_spot(frame: np.ndarray) -> tuple[float, float, float] | None:
@@ -308,6 +313,8 @@ def spot_of(group: PictureGroup, seen: Observations) -> SpeckleSpot:
         With too few frames that show a spot, or if the surface did not move.
     """
     w = _windows_of(group)
+    if not np.ptp(w.light[:, w.inside], axis=0).any():
+        raise MeasureError("all frames are the same picture", remedy="list frames that were taken one after the other, not copies")
     grains = _grains_of(w, seen, group.facts.wavelength_nm or seen.stated.wavelength_nm)
     if grains.stays > SAME:
         what = f"{grains.stays:.0%} of the grain pattern is the same in all frames: the shift of the centre by it is a constant"
@@ -397,7 +404,9 @@ def _grains_of(w: _Windows, seen: Observations, wavelength_nm: float | None) -> 
     smooth = ndimage.gaussian_filter(mean, max(0.3 * w.radius, 0.7))  # a pattern that stays does not choose the pixels
     lit = w.inside & ~ndimage.binary_dilation(w.full) & (smooth > LIT * smooth[w.inside].max())
     count = len(light)
-    none = replace(Estimates.empty(), reasons={"contrast_rel": "the spot is saturated: take a shorter exposure"})
+    full = bool((w.inside & w.full).any())
+    why = "the spot is saturated: take a shorter exposure" if full else "the spot is too small for its grains: make it larger, 6 px or more"
+    none = replace(Estimates.empty(), reasons={"contrast_rel": why})
     if lit.sum() < 20 or w.full[w.inside].mean() > 0.5:
         zero = np.zeros(0)
         return _Grains(np.zeros((0, 2)), zero, zero, np.zeros((0, 0)), none, 0.0, 0.0, np.eye(count), np.ones(1), 0.0)

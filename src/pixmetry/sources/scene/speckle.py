@@ -11,6 +11,7 @@ from pixmetry.camera.observations import Observations, of_pictures
 from pixmetry.camera.signal import Kind
 from pixmetry.camera.source import Parameters, Source, quantity
 from pixmetry.camera.speckle import pixel_covariance
+from pixmetry.core.errors import MeasureError
 from pixmetry.core.number import Estimates
 
 
@@ -39,7 +40,11 @@ def measure(observations: Observations) -> Estimates:
     fit = of_pictures(
         None if found is None else found.fit, names, where="scene.speckle", pictures="a laser spot on a moved surface", kind="speckle"
     )
-    if "contrast_rel" in fit and 1 < fit["contrast_rel"].value < 1 + LARGEST_U * fit["contrast_rel"].u:
+    if "contrast_rel" in fit and fit["contrast_rel"].value >= 1 + LARGEST_U * fit["contrast_rel"].u:
+        bent = f"the light seems to have a contrast of {fit['contrast_rel'].value:.2f}, and that of a laser has at most 1"
+        remedy = "take frames with a straight response (gamma 1), without sharpening, and with a surface that moves as a whole"
+        raise MeasureError(bent, where="scene.speckle", remedy=remedy)
+    if "contrast_rel" in fit and fit["contrast_rel"].value > 1:
         values = fit.values.copy()
         values[fit.index("contrast_rel")] = 1.0
         fit = replace(fit, values=values)
