@@ -66,6 +66,11 @@ def test_the_motion_of_a_scene_is_measured(rng: np.random.Generator, tmp_path: P
     (tmp_path / "out.frames.jsonl").write_bytes(b"".join(log.splitlines(keepends=True)[:14]))
     again = series(tmp_path, tmp_path / "out", interval_s=120.0)  # goes on with the same places
     np.testing.assert_allclose(again.drift.values, found.drift.values, atol=1e-12)
+    for number in ("0a", "0b"):  # and without the frame that chose the places: another one does, and no place of the log is taken
+        write_frame(tmp_path / f"{number}.png", field.moved(0, 0), 8)
+    (tmp_path / "00.png").rename(tmp_path / "0c.png")
+    longer, alone = (series(tmp_path, tmp_path / name, interval_s=120.0) for name in ("out", "c"))
+    np.testing.assert_allclose(longer.drift.values, alone.drift.values, atol=1e-12)
     done = CliRunner().invoke(main, ["series", str(tmp_path), "-o", str(tmp_path / "b"), "--interval", "120", "--kind", "texture"])
     assert done.exit_code == 0 and "places of the texture" not in done.output, done.output
 

@@ -128,7 +128,7 @@ def series(
         log = SeriesLog(Path(f"{str(output).rstrip('/')}.frames.jsonl"), told)
         for path, name in zip(files, names_of(files), strict=True):
             if _holder(path).stat().st_mtime > log.written_s:  # another frame of the same name
-                log.forget(name, named[0][0])
+                log.forget(name)
     try:
         found = measure_series(
             named,
@@ -231,8 +231,10 @@ def measure_series(
         raise MeasureError("no frames", where="series", remedy="name frames of a fixed field of targets, or of a texture")
     log = SeriesLog() if log is None else log
     shape = log.shape
+    if log.texture_of and log.texture_of != named[0][0]:  # other places of another first frame
+        log.done.clear()
     seen = {k: log.done[name] for k, (name, _, _) in enumerate(named) if name in log.done}
-    textured = kind == TEXTURE or log.textured
+    textured = kind == TEXTURE or bool(log.texture_of)
     if not textured and kind is None and not seen:
         textured = not _shows_targets(named, options)
     texture = texture_of(named[0][2](), named[0][0]) if textured and len(seen) < len(named) else None
@@ -250,9 +252,8 @@ def measure_series(
 
     waiting = [k for k in range(len(named)) if k not in seen]
     for k, found, size in imap_tiles(work, waiting):
-        if shape is None:
-            shape = size
-            log.put_shape(size, textured=textured)
+        shape = shape or size
+        log.put_shape(shape, texture_of=named[0][0] if textured else "")
         log.put(found)
         seen[k] = found
         told("locating", len(seen), len(named))

@@ -34,7 +34,7 @@ class SeriesLog:
     def __init__(self, path: Path | None = None, options: Mapping[str, Any] | None = None) -> None:
         self.done: dict[str, FrameTargets] = {}
         self.shape: tuple[int, int] | None = None
-        self.textured = False  # places of a texture, found by the first frame
+        self.texture_of = ""  # the frame that chose the places of a texture; none where targets are found
         self._file: BinaryIO | None = None
         if path is None:
             return
@@ -66,7 +66,9 @@ class SeriesLog:
                 if number == 0:
                     known = record["schema"] == LOG_SCHEMA
                 elif "rows" in record:
-                    self.shape, self.textured = (int(record["rows"]), int(record["cols"])), bool(record.get("textured", False))
+                    self.shape, self.texture_of = (int(record["rows"]), int(record["cols"])), str(record.get("texture_of", ""))
+                    if self.texture_of:  # chosen anew: the places of the frames before are others
+                        self.done.clear()
                     continue
                 else:
                     found = FrameTargets.from_record(record)
@@ -80,21 +82,22 @@ class SeriesLog:
                 raise InputError("the log was begun with other options", where=str(self.path), value=record["options"], remedy=remedy)
         return sum(len(line) for line in lines)
 
-    def put_shape(self, shape: tuple[int, int], *, textured: bool) -> None:
-        """Note the size of the frames, and whether places of a texture are followed."""
-        if self.shape is None:
-            self.shape, self.textured = shape, textured
-            self._write({"rows": shape[0], "cols": shape[1], "textured": textured})
+    def put_shape(self, shape: tuple[int, int], *, texture_of: str) -> None:
+        """Note the size of the frames, and which of them chose the places of a texture."""
+        if (self.shape, self.texture_of) != (shape, texture_of):
+            self.shape, self.texture_of = shape, texture_of
+            self._write({"rows": shape[0], "cols": shape[1], "texture_of": texture_of})
 
     def put(self, found: FrameTargets) -> None:
         """Add a frame; it is on the disk when this returns."""
         self.done[found.name] = found
         self._write(found.to_record())
 
-    def forget(self, name: str, first: str) -> None:
-        """Forget a frame that was taken anew; all of them where the places of a texture are those of the first one."""
-        if self.textured and name == first:
+    def forget(self, name: str) -> None:
+        """Forget a frame that was taken anew; all of them where it chose the places of a texture."""
+        if name == self.texture_of:
             self.done.clear()
+            self.texture_of = ""
         self.done.pop(name, None)
 
     def _write(self, record: Mapping[str, Any]) -> None:

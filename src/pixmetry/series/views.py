@@ -121,7 +121,7 @@ def views_of(
     shown = [v for v in views if len(v.place)]
     if len(shown) < LEAST_VIEWS:
         empty = f", {len(views) - len(shown)} of {len(views)} frames show none" if len(shown) < len(views) else ""
-        what = f"{len(shown)} view of targets with a radius of {LEAST_RADIUS_PX:g} px or more{empty}"
+        what = f"{len(shown)} view{'s' * (len(shown) != 1)} of targets with a radius of {LEAST_RADIUS_PX:g} px or more{empty}"
         raise MeasureError(what, where="views", remedy="take round targets of 6 px or more from 8 sides, below saturation")
     number = np.concatenate([np.full(len(v.place), k) for k, v in enumerate(shown)])
     gradient, u, shape, offset, place = (
@@ -230,7 +230,8 @@ def _angles(views: Sequence[View], pitch_ratio: float) -> tuple[Array, Array]:
         size = float(np.sqrt(max(mean @ mean - u**2, 0.0)))
         ratio = np.sqrt((1 - size) / (1 + size))
         angles.append(np.degrees(np.arccos(ratio)))
-        us.append(np.degrees(u / np.sqrt(max(2 * size, 2 * u))))  # α² = 2 e
+        size = min(max(size, u), 0.999)
+        us.append(np.degrees(u / ((1 + size) * np.sqrt(2 * size * (1 - size)))))  # cos² α = (1 − e)/(1 + e)
     return np.array(angles), np.array(us)
 
 
