@@ -29,6 +29,7 @@ METHOD = (
 )
 PULSED = "sum of a target in the light of a pulse and, spread along its path, in the steady light, fitted to the pixels of both fields"
 PULSE_STEPS = 3
+PLACE_U_REL = 0.2  # of the exposure: where the pulses are in it, if it was not stated
 LEAST_TARGETS = 4  # for the scatter between them
 CONFOUNDERS = (
     "the course of the light within the exposure: only its variance is told, as that of an even exposure",
@@ -154,7 +155,7 @@ def exposure_of(targets: Sequence[Sequence[Look]], row_time_s: float = 0.0, u_sp
     return Estimates.from_rows([row], method=METHOD, confounders=CONFOUNDERS, limits=limits, reasons={"exposure_s": why})
 
 
-def pulses_of(targets: Sequence[Sequence[tuple[Look, Look]]], exposure_s: float, field_s: float) -> Estimates:
+def pulses_of(targets: Sequence[Sequence[tuple[Look, Look]]], exposure_s: float, field_s: float, stated_s: float = 0.0) -> Estimates:
     """Time between two pulses of light, and the share of steady light, from pictures in the first and in the second field.
 
     Parameters
@@ -163,6 +164,8 @@ def pulses_of(targets: Sequence[Sequence[tuple[Look, Look]]], exposure_s: float,
         Pictures of each target in the first and in the second field of a frame.
     exposure_s, field_s : float
         Length of the exposure of a field, and time between the fields, as found without pulses.
+    stated_s : float
+        The exposure that is set, at whose end the first pulse is; 0 where it was not stated.
 
     Returns
     -------
@@ -173,9 +176,9 @@ def pulses_of(targets: Sequence[Sequence[tuple[Look, Look]]], exposure_s: float,
     -----
     Each picture is that of the pulse and, with the share of the steady light, that of the target while it moves through the exposure: it
     lies before the first pulse, which ends the first exposure, and behind the second one. The covariance is that of the means over the
-    targets.
+    targets; where the exposure is not as long as stated, or none was stated, u holds that the pulses may be elsewhere within it.
     """
-    found = []
+    found, whole = [], stated_s or exposure_s
     for pairs in targets:
         moving = sorted(pairs, key=lambda pair: float(pair[0].speed_px_s @ pair[0].speed_px_s))
         moving = moving[:: max(1, -(-2 * len(moving) // MOST_PICTURES))]
@@ -183,7 +186,7 @@ def pulses_of(targets: Sequence[Sequence[tuple[Look, Look]]], exposure_s: float,
             continue
         late, share = _separation(moving, 0.0), np.nan
         for _ in range(PULSE_STEPS):  # the middle of the steady light is known from the pulses
-            middles = (0.5 * (late - exposure_s), field_s - 0.5 * (exposure_s + late))
+            middles = (0.5 * (late - whole), field_s - 0.5 * (whole + late))
             looks = [replace(look, steady_s=(exposure_s, m)) for pair in moving for look, m in zip(pair, middles, strict=True)]
             fit = _fitted(looks, 0.0)
             share = np.nan if fit is None else fit.square
@@ -200,6 +203,8 @@ def pulses_of(targets: Sequence[Sequence[tuple[Look, Look]]], exposure_s: float,
         return Estimates.from_rows([], reasons=dict.fromkeys(names, f"fewer than {LEAST_TARGETS} targets that a pulse shows can be fitted"))
     values = np.array(found)
     mean, covariance, dof = values.mean(axis=0), np.cov(values.T) / len(values), float(len(values) - 1)
+    doubt = abs(exposure_s / stated_s - 1) if stated_s else PLACE_U_REL
+    covariance = covariance + np.diag([mean[1] * doubt * exposure_s, mean[1] * doubt]) ** 2
     u = np.sqrt(np.diag(covariance))
     reasons, limits = {}, set()
     for k, name in enumerate(names):

@@ -289,7 +289,7 @@ def _pulses(parts: Sequence[_Followed], fields: Estimates, exposure: Estimates) 
         for i, pairs in _looks(part).items():
             if i in own:
                 looks.setdefault(own[i], []).extend((odd, even) if first else (even, odd) for even, odd in pairs)
-    return pulses_of(list(looks.values()), known[1] * scale, known[0])
+    return pulses_of(list(looks.values()), known[1] * scale, known[0], pulsed[0].run.exposure_s)
 
 
 def _fields(parts: Sequence[_Followed], steady: Sequence[_Followed]) -> tuple[Estimates, Array, Array]:
