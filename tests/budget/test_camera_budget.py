@@ -339,3 +339,12 @@ def test_what_cannot_be_computed_is_left_out_and_said() -> None:
     assert [r.source_id for r in found.left_out] == [prnu.id] and name == found.left_out[0].name
     assert "does not hold here" in html_of(page_of(found)) and whole.left_out == ()
     assert 0 < found.one.after_px[0] < whole.one.after_px[0]
+
+
+def test_a_source_that_stands_twice_in_a_chain_has_its_names_in_the_table() -> None:
+    """The lens of a data sheet has two spreads: diffraction, and what else blurs."""
+    camera = load_camera("imx264_like")
+    first = next(e for e in camera.chain if e.source.id == "optics.point_spread")
+    twice = replace(camera, chain=(replace(first, name="lens blur"), *camera.chain))
+    rows = Table(Setting(twice, read_scenario({})), TargetEstimator()).rows({"optics.point_spread"})
+    assert {r.title for r in rows} == {"Point spread of the lens", "Point spread of the lens (lens blur)"}
