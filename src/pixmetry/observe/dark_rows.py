@@ -237,7 +237,9 @@ def _coherent_line(means: np.ndarray, cols: int) -> _Line | None:
     per_col = float(np.angle((z[:, 1:] * z[:, :-1].conj()).sum())) / (2 * np.pi) * parts / cols
     u_phase = found.u_amplitude_rel / found.amplitude_rel * np.sqrt(2 * parts)
     u_per_col = u_phase * np.sqrt(2) / (parts - 1) / (2 * np.pi) * parts / cols
-    return _Line(found.amplitude_rel, found.u_amplitude_rel, found.per_row, found.u_per_row, per_col, float(max(u_per_col, 1e-9)))
+    whole_again = np.sqrt((frames - 1) / frames)  # the mean over the frames takes nothing of a wave that goes on
+    amplitude, u_amplitude = found.amplitude_rel * whole_again, found.u_amplitude_rel * whole_again
+    return _Line(amplitude, u_amplitude, found.per_row, found.u_per_row, per_col, float(max(u_per_col, 1e-9)))
 
 
 def _floor(power: np.ndarray, k: int) -> float:
@@ -291,7 +293,7 @@ def _flicker_of(
     from scipy.optimize import minimize_scalar
 
     frames, rows, cols = size
-    along, data_h, weight_h = _binned(spectra, rows, hum)
+    along, data_h, weight_h, of_hum = _binned(spectra, rows, hum)
     ordinates = np.array([k for k in range(1, len(power) - 1) if k not in lines])
     data_v, weight_v = power[ordinates], np.full(len(ordinates), float(frames - 1))
     data, weight = np.concatenate([data_h, data_v]), np.concatenate([weight_h, weight_v])
@@ -300,7 +302,8 @@ def _flicker_of(
     def design(shape: np.ndarray) -> np.ndarray:
         white = np.concatenate([np.ones(len(data_h)), np.full(len(data_v), 1 / cols)])
         own = np.concatenate([np.zeros(len(data_h)), np.ones(len(data_v))])
-        return np.stack([shape, white, own], axis=1)
+        parts = [shape, white, own, np.concatenate([of_hum, np.zeros(len(data_v))])]
+        return np.stack(parts if of_hum.any() else parts[:3], axis=1)
 
     def solved(shape: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
         return _whittle(design(shape), data, weight)
@@ -342,8 +345,9 @@ def _flicker_of(
     covariance = np.linalg.pinv(full.T @ (weight[:, None] * full), hermitian=True) * scatter
     rms = float(np.sqrt(values[0]))
     octaves = _octaves(corner, size, line_px)
-    jacobian = np.array([[1 / (2 * rms), 0, 0, 0], [0, 0, 0, corner]])
-    joint = jacobian @ covariance @ jacobian.T
+    at = [0, len(covariance) - 1]
+    jacobian = np.diag([1 / (2 * rms), corner])
+    joint = jacobian @ covariance[np.ix_(at, at)] @ jacobian
     units = ("DN", "1")
     why = {"rms_dn": f"down to {octaves} octaves below the corner, one cycle a frame; slower noise is not seen"}
     found = Estimates(
@@ -369,19 +373,19 @@ def _rows_of(model: np.ndarray, ordinates: np.ndarray, first: int, power: np.nda
     return fitted
 
 
-def _binned(spectra: Spectra, rows: int, hum: tuple[float, float]) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
-    """Ordinates of the spectrum along the rows in bins, its mean in each, and half the degrees of freedom.
+def _binned(spectra: Spectra, rows: int, hum: tuple[float, float]) -> tuple[list[np.ndarray], np.ndarray, np.ndarray, np.ndarray]:
+    """Ordinates of the spectrum along the rows in bins; its mean in each; half the degrees of freedom; and what a hum gives to them.
 
-    Of a hum, amplitude and cycles per pixel, what it turns along a row is taken off.
+    A hum of an amplitude and so many cycles per pixel gives A²/4 N sinc² of the distance, times what the phases of the pairs of frames make
+    of it: a factor that is fitted.
     """
     count, cols = len(spectra.frequency_h), round(1 / spectra.frequency_h[1])
     along = np.arange(count)
     turned = hum[0] ** 2 / 4 * cols * (np.sinc(along - hum[1] * cols) ** 2 + np.sinc(along + hum[1] * cols) ** 2)
-    temporal = np.maximum(spectra.temporal_h_dn2 - turned, 1e-9)
     edges = np.unique(np.rint(np.geomspace(1, count - 1, BINS)).astype(int))
     bins = [np.arange(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
-    data = np.array([temporal[b].mean() for b in bins])
-    return bins, data, np.array([len(b) for b in bins], float) * spectra.n_pairs * (rows - 1)
+    data, of_hum = (np.array([values[b].mean() for b in bins]) for values in (spectra.temporal_h_dn2, turned))
+    return bins, data, np.array([len(b) for b in bins], float) * spectra.n_pairs * (rows - 1), of_hum
 
 
 def _octaves(corner: float, size: tuple[int, int, int], line_px: float) -> int:

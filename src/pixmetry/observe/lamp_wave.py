@@ -17,6 +17,7 @@ LEAST_ROWS = 32
 EXTRA = 6.0  # in power over the floor, which is a median of few ordinates
 LEAST_CYCLES = 0.2
 ROUNDING = 1e-9  # of the light: what frames that are copies of each other differ by
+BESIDE_HUM = 3.0  # cycles over the rows that a lamp must be off a hum
 PAD = 3  # ordinates of the periodogram for each independent one
 ALIKE = 0.2  # largest scatter of a lamp's wave along the rows, over the wave
 LEAST_WAVE = 6.0  # amplitude over its u
@@ -37,6 +38,7 @@ def row_wave(
     static: np.ndarray,
     place: np.ndarray,
     start: LampWave | None = None,
+    hum_per_row: float = 0.0,
 ) -> LampWave | None:
     """The strongest sinusoid over rows and frames in the light of the static parts; None where none stands out.
 
@@ -55,6 +57,8 @@ def row_wave(
         When frames were taken, in frame times.
     start : LampWave, optional
         A wave that was found before, to be fitted anew.
+    hum_per_row : float
+        Cycles per row of a hum that dark frames show, which is no light; 0 without.
 
     Notes
     -----
@@ -72,14 +76,14 @@ def row_wave(
         return None
     if start is not None:
         return _refined(value, place, row, start.per_frame, start.per_row)
-    found = strongest_wave(value, place, row)
+    found = strongest_wave(value, place, row, hum_per_row)
     if found is None:
         return None
     parts = [light_of_rows(rows, mean, gain, offset, black, static & part) for part in _across(static, rows)]
     return found if _is_alike(found, parts, place) else None
 
 
-def strongest_wave(value: np.ndarray, place: np.ndarray, row: np.ndarray) -> LampWave | None:
+def strongest_wave(value: np.ndarray, place: np.ndarray, row: np.ndarray, hum_per_row: float = 0.0) -> LampWave | None:
     """The strongest sinusoid over frames and rows of values without the means of frames and of rows; None where none stands out.
 
     The floor of each frequency over the rows is the median over those from frame to frame: noise that rows share is no wave.
@@ -90,6 +94,8 @@ def strongest_wave(value: np.ndarray, place: np.ndarray, row: np.ndarray) -> Lam
     power = np.abs(np.fft.rfft2(grid)) ** 2
     per_row, span = np.arange(power.shape[1]) / grid.shape[1], int(row[-1] - row[0] + 1)
     allowed = per_row * span >= LEAST_CYCLES
+    if hum_per_row:
+        allowed &= np.abs(per_row - hum_per_row) * span > BESIDE_HUM
     power = power[:, allowed]
     floor = np.median(power, axis=0) / np.log(2)
     ratio = power / np.maximum(floor, 1e-3 * np.median(floor))
@@ -214,7 +220,10 @@ def lamp_estimates(found: Sequence[FrameSequence], refused: Sequence[str], seen:
         return replace(Estimates.from_rows(rows, method=METHOD), reasons={"depth_rel": reason, "frequency_hz": why})
     depth = wave.amplitude_rel / abs(left)
     by_frequency = -depth * slope / left * u_hertz
-    u = float(np.hypot(wave.u_amplitude_rel / left, by_frequency))
+    fit = seen.photon_transfer_fit
+    black = fit["offset_dn"].value if fit is not None and "offset_dn" in fit else 0.0
+    bend = seen.bend_rel(max(float(best.level_dn.mean()) - black, 0.0))
+    u = float(np.linalg.norm([wave.u_amplitude_rel / left, by_frequency, bend * depth]))
     cross = by_frequency * u_hertz
     confounders = [] if seen.dark_stack is not None else ["hum (electronics.supply_pickup): a dark stack tells it from a lamp"]
     reasons = {"frequency_hz": why}

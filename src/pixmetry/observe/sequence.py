@@ -87,11 +87,13 @@ def sample_places(shape: tuple[int, ...]) -> tuple[slice, slice]:
 def reduce_sequences(groups: Sequence[PictureGroup], seen: Observations) -> Observations:
     """Follow gain and black of every sequence, and fit loop and lamp to them."""
     dark = dark_level(seen)
+    of_rows = seen.dark_rows
+    hum = of_rows.hum["per_row"].value if of_rows is not None and "per_row" in of_rows.hum else 0.0
     found, refused = [], []
     stretches = [(group, order) for group in groups for order in _stretches(group)]
     for number, (group, order) in enumerate(stretches, start=1):
         try:
-            found.append(sequence_of(group, dark, order))
+            found.append(sequence_of(group, dark, order, hum))
         except MeasureError as problem:
             refused.append(f"sequence {number} of {len(stretches)}: {problem.what}" + (f" ({problem.remedy})" if problem.remedy else ""))
     loop = loop_of_all(found, refused, seen)
@@ -136,8 +138,8 @@ def _stretches(group: PictureGroup) -> list[np.ndarray]:
     return np.split(order, np.flatnonzero(steps > MOST_PAUSE * np.median(steps)) + 1)
 
 
-def sequence_of(group: PictureGroup, dark: tuple[float, float] | None, order: np.ndarray) -> FrameSequence:
-    """What the frames of one sequence tell, given by their index in the group.
+def sequence_of(group: PictureGroup, dark: tuple[float, float] | None, order: np.ndarray, hum_per_row: float = 0.0) -> FrameSequence:
+    """What the frames of one sequence tell, given by their index in the group, the level of dark frames and the hum in their rows.
 
     Raises
     ------
@@ -163,7 +165,7 @@ def sequence_of(group: PictureGroup, dark: tuple[float, float] | None, order: np
     blocks = np.array([sums.blocks[i] for i in order]).reshape(count, -1)
     place, gaps, interval = _places(group, order)
     row_means = np.array([sums.rows[i] for i in order])
-    bands = _bands(row_means, blocks, usable, sums.blocks[0].shape, place, dark)
+    bands = _bands(row_means, blocks, usable, sums.blocks[0].shape, place, dark, hum_per_row)
     if bands is not None and dark is not None:
         light = bands.light(place, np.arange(row_means.shape[1]))
         blocks = dark[0] + (blocks - dark[0]) / _by_block(light, sums.blocks[0].shape)
@@ -225,7 +227,13 @@ def sequence_of(group: PictureGroup, dark: tuple[float, float] | None, order: np
 
 
 def _bands(
-    rows: np.ndarray, blocks: np.ndarray, usable: np.ndarray, shape: tuple[int, ...], place: np.ndarray, dark: tuple[float, float] | None
+    rows: np.ndarray,
+    blocks: np.ndarray,
+    usable: np.ndarray,
+    shape: tuple[int, ...],
+    place: np.ndarray,
+    dark: tuple[float, float] | None,
+    hum_per_row: float,
 ) -> LampWave | None:
     """Bands of a lamp over the rows, sought where the frame is roughly as it always is.
 
@@ -243,7 +251,7 @@ def _bands(
     free, mean = blocks, rows.mean(axis=0)
     for _ in range(MOST_ROUNDS):
         found = _factors(free, about)
-        before, wave = wave, row_wave(rows, mean, found.gain, found.offset, black, about.reshape(shape), place, wave)
+        before, wave = wave, row_wave(rows, mean, found.gain, found.offset, black, about.reshape(shape), place, wave, hum_per_row)
         if wave is None or (before is not None and abs(wave.amplitude_rel - before.amplitude_rel) < 0.1 * wave.u_amplitude_rel):
             break
         if dark is None:
