@@ -71,7 +71,7 @@ def reduce_dark_rows(
     taken: dict[str, tuple[float, float]] = {"hum": (0.0, 0.0), "row": (0.0, 0.0), "pixel": (0.0, 0.0)}
     if line is not None:
         taken["hum"] = (line[0] ** 2 / 2, line[0] * line[1])
-    turn = (0.0, 0.0) if line is None else (line[0], _turns_along(hum))
+    turn = (line[0], _turns_along(hum)) if line is not None and "per_col" in hum else (0.0, 0.0)
     lines = () if line is None else _ordinates_of(line[2], shape[0], scan)
     if noise_filter is not None and noise_filter.kind != WHITE:
         why = f"the frames are filtered ({noise_filter.name}), and their spectrum with them"
@@ -136,6 +136,11 @@ def _hum_of(
             why = "the wave of the rows turns along them: it counts as grabber.phase_pattern"
             return replace(Estimates.empty(), reasons={"amplitude_dn": why}), None, scan
     hertz_of = (0.0, "") if stated.line_time_us is None else _hertz(found, stated.line_time_us, stated.pixel_clock_mhz)
+    if found.slow:
+        still = "the hum stands nearly still from frame to frame: its amplitude counts in part as fixed pattern"
+        none = replace(Estimates.empty(), reasons={"amplitude_dn": f"{still}; take the frames at another rate"})
+        # half of what is seen of it, with that for its u, is taken off the noise of the rows
+        return none, (found.amplitude / 2**0.5, found.amplitude / 8**0.5, found.per_row), scan
     clocked = stated.line_time_us is not None and stated.pixel_clock_mhz is not None
     if stated.line_time_us is not None and stated.pixel_clock_mhz is not None:
         per_col, u_per_col = hertz_of[0] * 1e-6 / stated.pixel_clock_mhz, 0.0
@@ -172,6 +177,7 @@ class _Line:
     u_per_row: float
     per_col: float
     u_per_col: float
+    slow: bool = False  # stands nearly still from frame to frame
 
 
 def _line_of(means: np.ndarray, cols: int) -> _Line | None:
@@ -220,7 +226,10 @@ def _line_of(means: np.ndarray, cols: int) -> _Line | None:
     u_per_row = float(np.sqrt(6 * noise / (np.pi**2 * square * rows**3 * frames)))
     u_phase = float(np.sqrt(2 * noise * parts / (square * rows * frames)))  # of a part, in radians
     u_per_col = u_phase * np.sqrt(2 / (parts - 1)) / (2 * np.pi) * parts / cols / np.sqrt(parts - 1)
-    return _Line(float(seen), u_seen, per_row, u_per_row, per_col, float(max(u_per_col, 1e-9)))
+    own = z.mean(axis=1)
+    step = (own[1:] * own[:-1].conj()).sum() / max(float((np.abs(own) ** 2).sum()), 1e-12)
+    slow = bool(abs(step) > 0.6 and abs(np.angle(step)) < 2 * np.pi / frames)
+    return _Line(float(seen), u_seen, per_row, u_per_row, per_col, float(max(u_per_col, 1e-9)), slow)
 
 
 def _coherent_line(means: np.ndarray, cols: int) -> _Line | None:
@@ -239,7 +248,8 @@ def _coherent_line(means: np.ndarray, cols: int) -> _Line | None:
     u_per_col = u_phase * np.sqrt(2) / (parts - 1) / (2 * np.pi) * parts / cols
     whole_again = np.sqrt((frames - 1) / frames)  # the mean over the frames takes nothing of a wave that goes on
     amplitude, u_amplitude = found.amplitude_rel * whole_again, found.u_amplitude_rel * whole_again
-    return _Line(amplitude, u_amplitude, found.per_row, found.u_per_row, per_col, float(max(u_per_col, 1e-9)))
+    slow = abs(found.per_frame) * frames < 0.75
+    return _Line(amplitude, u_amplitude, found.per_row, found.u_per_row, per_col, float(max(u_per_col, 1e-9)), slow)
 
 
 def _floor(power: np.ndarray, k: int) -> float:
