@@ -344,7 +344,8 @@ def test_what_cannot_be_computed_is_left_out_and_said() -> None:
 def test_a_source_that_stands_twice_in_a_chain_has_its_names_in_the_table() -> None:
     """The lens of a data sheet has two spreads: diffraction, and what else blurs."""
     camera = load_camera("imx264_like")
-    first = next(e for e in camera.chain if e.source.id == "optics.point_spread")
-    twice = replace(camera, chain=(replace(first, name="lens blur"), *camera.chain))
+    source = get_source("optics.point_spread")
+    two = (Element(name, source, source.make({"sigma_px": 0.4})) for name in (source.id, "lens blur"))
+    twice = replace(camera, chain=(*two, *camera.chain))
     rows = Table(Setting(twice, read_scenario({})), TargetEstimator()).rows({"optics.point_spread"})
     assert {r.title for r in rows} == {"Point spread of the lens", "Point spread of the lens (lens blur)"}
