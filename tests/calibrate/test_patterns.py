@@ -13,8 +13,8 @@ from calibrate.networks import SENSOR, Simulated, predicted, simulate
 from pixmetry.calibrate.bundle.model import NAMES
 from pixmetry.calibrate.bundle.network import SCALE
 from pixmetry.calibrate.bundle.solve import calibrate_network
-from pixmetry.calibrate.checks.added_terms import AddedTerms, derivatives
-from pixmetry.calibrate.checks.causes import causes_of
+from pixmetry.calibrate.checks.added_terms import AddedTerms, Normals, derivatives
+from pixmetry.calibrate.checks.causes import causes_of, chosen_among
 from pixmetry.calibrate.checks.patterns import MEANING, pattern_findings, residual_patterns
 from pixmetry.calibrate.records import Pattern
 from pixmetry.camera.catalogue import sources
@@ -248,3 +248,18 @@ def test_no_pattern_is_seen_beside_scales_of_images_that_were_estimated(rng):
         simulated = simulate(rng, images=14, points=40, per_image=("x_scale",))
         adjustment = adjusted(simulated.network, simulated)
         assert min(record.p for record in residual_patterns(adjustment)) > 1e-8
+
+
+def test_what_no_chosen_pattern_explains_is_told():
+    """60 terms that explain 200 of 1000 squares are too many to be chosen, but no wave along x explains them."""
+    right = np.concatenate([np.full(60, np.sqrt(200 / 60)), np.full(2, np.sqrt(60.0))])
+    parts = {"field": np.arange(60), "wave_yy": np.arange(60, 62)}
+    places = chosen_among(Normals(np.eye(62), np.eye(62), right), parts, {"field": 1, "wave_yy": 1}, 1000.0, 1000.0)
+    assert not places["wave_yy"].behind and places["field"].behind == "wave_yy"
+    f = (200 / 60) / ((1000 - 200 - 120) / (1000 - 62))
+    assert places["field"].p_left == pytest.approx(stats.f.sf(f, 60, 938), rel=1e-6)
+    wave, field = (Pattern(n, "a", 0.01, None, 1e-9, significant=True, text=MEANING[n][0], advice="look") for n in ("wave_yy", "field"))
+    (said,) = pattern_findings([wave, replace(field, behind="wave_yy")])
+    assert said.text.endswith("It also explains that residuals depend on the position in the frame")
+    (said,) = pattern_findings([wave, replace(field, behind="wave_yy", left=True)])
+    assert "does not explain all" in said.text and "also explains" not in said.text

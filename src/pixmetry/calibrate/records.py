@@ -697,7 +697,9 @@ class Pattern:
     confirmed : bool
         Whether its cause was measured, with all that residuals have in common in its uncertainty.
     behind : str
-        The pattern beside which it explains nothing more; empty: none.
+        The pattern beside which it explains least, where it explains too little beside those chosen for its number of terms; empty: none.
+    left : bool
+        Whether it is nevertheless significant beside those chosen: they do not explain all of it.
     """
 
     name: str
@@ -716,6 +718,7 @@ class Pattern:
     causes: tuple[str, ...] = ()
     gain: float = 0.0
     behind: str = ""
+    left: bool = False
     confirmed: bool = False
 
     @property

@@ -40,12 +40,15 @@ class Place:
     rivals : tuple of str
         Patterns that explain the same nearly as well, or better.
     behind : str
-        The pattern beside which it explains nothing more; empty: it was chosen.
+        The pattern beside which it explains least; empty: it was chosen.
+    p_left : float
+        Of an F-test beside all that were chosen, of a pattern that was not.
     """
 
     gain: float
     rivals: tuple[str, ...] = ()
     behind: str = ""
+    p_left: float = 1.0
 
 
 def places_of(terms: AddedTerms, candidates: Sequence[Candidate]) -> dict[str, Place]:
@@ -64,8 +67,19 @@ def places_of(terms: AddedTerms, candidates: Sequence[Candidate]) -> dict[str, P
     """
     if not candidates:
         return {}
-    model = _Explained.of(terms, candidates)
-    left = [one.name for one in candidates]
+    blocks = [terms.as_rows(one.columns) for one in candidates]
+    ends = np.cumsum([0, *(block.shape[1] for block in blocks)])
+    parts = {one.name: np.arange(a, b) for one, a, b in zip(candidates, ends[:-1], ends[1:], strict=True)}
+    out_of, adjustment = {one.name: one.out_of for one in candidates}, terms.adjustment
+    return chosen_among(terms.normals(_side_by_side(blocks)), parts, out_of, adjustment.sigma0**2 * adjustment.dof, float(adjustment.dof))
+
+
+def chosen_among(
+    normals: Normals, parts: Mapping[str, np.ndarray], out_of: Mapping[str, int], squares: float, dof: float
+) -> dict[str, Place]:
+    """The same by the normal equations of all candidates together: the numbers of each one's terms, and of how many it is the best."""
+    model = _Explained(normals, parts, out_of, squares, dof)
+    left = list(parts)
     chosen: list[str] = []
     found: dict[str, Place] = {}
     while left:
@@ -80,7 +94,7 @@ def places_of(terms: AddedTerms, candidates: Sequence[Candidate]) -> dict[str, P
         left = rest
     for name in left:
         alone = {other: model.gain(name, [other]) for other in chosen}
-        found[name] = Place(model.gain(name, chosen), behind=min(alone, key=lambda other: alone[other]))
+        found[name] = Place(model.gain(name, chosen), (), min(alone, key=lambda other: alone[other]), model.p(name, chosen))
     return found
 
 
@@ -94,17 +108,6 @@ class _Explained:
     squares: float
     dof: float
 
-    @classmethod
-    def of(cls, terms: AddedTerms, candidates: Sequence[Candidate]) -> _Explained:
-        blocks = [terms.as_rows(one.columns) for one in candidates]
-        ends = np.cumsum([0, *(block.shape[1] for block in blocks)])
-        parts = {one.name: np.arange(a, b) for one, a, b in zip(candidates, ends[:-1], ends[1:], strict=True)}
-        adjustment = terms.adjustment
-        return cls(
-            terms.normals(_side_by_side(blocks)), parts, {one.name: one.out_of for one in candidates},
-            adjustment.sigma0**2 * adjustment.dof, float(adjustment.dof),
-        )  # fmt: skip
-
     def gain(self, name: str, beside: Sequence[str]) -> float:
         """2 ln of the evidence for a pattern beside others."""
         before, rank = self._fall(beside)
@@ -114,6 +117,17 @@ class _Explained:
         floor = 1e-12 * self.squares
         ratio = max(self.squares - before, floor) / max(self.squares - after, floor)
         return float(self.dof * np.log(ratio) - (more - rank) * np.log(self.dof) - 2 * np.log(self.out_of[name]))
+
+    def p(self, name: str, beside: Sequence[str]) -> float:
+        """Of an F-test of a pattern beside others."""
+        from scipy import stats
+
+        before, rank = self._fall(beside)
+        after, more = self._fall([*beside, name])
+        if more <= rank or self.dof <= more:
+            return 1.0
+        variance = max(self.squares - after, 1e-12 * self.squares) / (self.dof - more)
+        return float(stats.f.sf((after - before) / (more - rank) / variance, more - rank, self.dof - more))
 
     def _fall(self, names: Sequence[str]) -> tuple[float, int]:
         if not names:

@@ -216,6 +216,7 @@ def _worded(found: Pattern, places: Mapping[str, Place], interface: str | None) 
         causes=tuple(cause.text for cause in causes),
         gain=place.gain,
         behind=place.behind,
+        left=place.p_left < found.level,
         text=text,
         advice=advice,
     )
@@ -251,12 +252,10 @@ def pattern_findings(patterns: Sequence[Pattern]) -> tuple[Finding, ...]:
         if one.behind and not (kind == "x_scale_drift" and one.behind in DRIFT):
             continue
         caused = f" ({words})" if (words := cause_words(one)) else ""
-        more = [
-            MEANING[p.name][0]
-            for p in significant
-            if p.behind == one.name and p.camera == one.camera and not {p.name, one.name} <= {*DRIFT}
-        ]
-        also = f". It also explains that {'; that '.join(more)}" if more else ""
+        more = [p for p in significant if p.behind == one.name and p.camera == one.camera and not {p.name, one.name} <= {*DRIFT}]
+        explained, rest = ([MEANING[p.name][0] for p in more if p.left == left] for left in (False, True))
+        also = f". It also explains that {'; that '.join(explained)}" if explained else ""
+        also += f". It does not explain all of the following, which are seen too: {'; '.join(rest)}" if rest else ""
         out.append(Finding(kind, f"{where}{one.text}{caused}{also}", one.advice[0].upper() + one.advice[1:] + ".", "warning"))
     return tuple(out)
 

@@ -159,7 +159,9 @@ def patterns(records: Sequence[Pattern], several: bool) -> list[dict[str, Any]]:
         what, _, _ = MEANING.get(r.name, (r.name, "", ""))
         title = f"{r.camera}: {what}" if several else sentence(what).rstrip(".")
         amplitude = px(r.amplitude_px) + (f" ± {px(r.u_px)}" if r.u_px is not None else "")
-        words = "" if not r.significant else f"explained where {MEANING[r.behind][0]}" if r.behind in MEANING else cause_words(r)
+        words = "" if not r.significant else cause_words(r)
+        if r.significant and r.behind in MEANING:
+            words = f"{'in part ' if r.left else ''}explained where {MEANING[r.behind][0]}"
         why = f"{sentence(words)}" if words else ""
         advice = " ".join(part for part in (why, sentence(r.advice)) if part)
         rows.append({"title": title, "amplitude": amplitude, "p": p_text(r.p), "found": r.significant, "advice": advice})
