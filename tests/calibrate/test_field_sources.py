@@ -183,7 +183,9 @@ def decaying(rng, scatter: float, interface: str | None):
 def test_the_decay_of_the_x_scale_is_measured(rng, scatter):
     found = decaying(rng, scatter, "analogue").scales
     u = np.sqrt(np.diag(found.covariance))
-    assert abs(found.start - 2e-3) < 6 * u[0] and abs(found.tau_s - 820) < 6 * u[1]
+    far = stats.t.isf(RATE / 4, found.dof)  # the scatter of 16 images is known to 13 degrees of freedom
+    assert abs(found.start - 2e-3) < far * u[0] and abs(found.tau_s - 820) < far * u[1]
+    assert found.dof == 13 or not scatter
     assert found.gain > 10 and u[0] < 3e-4 and u[1] < 250
 
 
@@ -215,8 +217,8 @@ def test_a_calibration_measures_the_surface_and_positions_are_corrected_by_it(rn
     params = a_surface(rng, simulated, 0.0).model_copy(update=plain)
     seen = met_at(predicted(simulated.network, simulated.truth), params) + NOISE_PX * rng.standard_normal((len(simulated.network), 2))
     made = pixmetry.calibrate(replace(simulated.network, x_px=seen[:, 0], y_px=seen[:, 1]), tmp_path / "out", options={"folds": 0})
-    first = next(f for f in made.findings if f.level == "warning")
-    assert first.kind == "unflatness" and "likely cause: a sensor that is not flat" in first.text
+    (said,) = (f for f in made.findings if f.kind == "unflatness")
+    assert said.level == "warning" and "likely cause: a sensor that is not flat" in said.text
     geometry = calibrated_geometry(read_calibration(tmp_path / "out"))
     own = calibrated_geometry(made)
     found = geometry.told["sensor.unflatness"]

@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from pixmetry.camera.noise_covariance import LAGS, charge_response, sampling_covariance
+from pixmetry.camera.noise_covariance import LAGS, NoiseFilter, charge_response, sampling_covariance
+from pixmetry.core.number import Estimates
 from pixmetry.observe.noise_covariance import LagProducts, lag_products
+from pixmetry.observe.noise_filter import before_correlation
 from pixmetry.observe.observe import Group, observe
 
 SHAPE, GAIN, NOISE_E, OFFSET, TOP = (120, 160), 0.5, 8.0, 60.0, 4095
@@ -173,3 +175,10 @@ def test_jitter_at_the_left_border_is_no_noise_of_the_light(rng):
     gain = seen.photon_transfer_fit["gain_dn_per_e"]
     assert seen.noise_filter.kind == "linear" and seen.noise_filter.name == "filter along the row"
     assert abs(gain.value - GAIN) < Z * gain.u and gain.u < 0.1 * GAIN
+
+
+def test_u_of_a_contrast_grows_with_it_when_a_filter_is_undone():
+    """A filter that leaves a quarter of the variance: the contrast before is twice as large, with half of the relative u of the factor."""
+    spatial = Estimates.from_rows([("prnu_pixel_rel", 0.01, 0.0, np.inf, "1")])
+    before = before_correlation(spatial, NoiseFilter(kind="linear", factor=4.0, u_factor=0.4), 100.0)["prnu_pixel_rel"]
+    assert before.value == pytest.approx(0.02) and before.u == pytest.approx(0.02 * 0.05)

@@ -345,7 +345,7 @@ def _clock_warm_up(scales: ImageScales | None, interface: str | None, origin: st
     if scales.p_left is not None and scales.p_left < RARE:
         reasons["scale_tau_s"] = "the x-scales scatter about the decay; its uncertainty holds that"
     return Estimates(
-        ("scale_error_rel", "scale_tau_s"), np.array([scales.start, scales.tau_s]), scales.covariance, np.full(2, np.inf), ("1", "s"),
+        ("scale_error_rel", "scale_tau_s"), np.array([scales.start, scales.tau_s]), scales.covariance, np.full(2, scales.dof), ("1", "s"),
         method=f"x-scales of the images of the {origin}", confounders=("sensor.affinity",), reasons=reasons,
     )  # fmt: skip
 

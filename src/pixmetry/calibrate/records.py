@@ -843,6 +843,8 @@ class ImageScales:
         Scale error of the first image, and time constant of its decay.
     covariance : ndarray, shape (2, 2), or None
         Of both.
+    dof : float
+        Of their u: few where it is the scatter of the images about the decay.
     """
 
     images: tuple[str, ...]
@@ -855,6 +857,7 @@ class ImageScales:
     start: float = 0.0
     tau_s: float = np.nan
     covariance: np.ndarray | None = None
+    dof: float = np.nan
 
 
 @dataclass(frozen=True)

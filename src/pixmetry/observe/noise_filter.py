@@ -517,7 +517,7 @@ def before_correlation(spatial: Estimates, found: NoiseFilter, shot_dn2: float) 
         evened += ["dsnu_pixel_dn", *(("prnu_col_rel", "dsnu_col_dn") if found.name == LINE else ())]
     own = np.array([name in evened for name in spatial.names])
     factor = np.where(own, scale, 1.0)
-    more = np.where(own, spatial.values * u, 0.0)
+    more = np.where(own, spatial.values * factor * u, 0.0)
     return replace(
         spatial,
         values=spatial.values * factor,

@@ -107,11 +107,11 @@ def _fitted(means: Array, basis: Array, patterns: Sequence[Array]) -> tuple[Arra
     var = float(left @ left) / max(len(means) - design.shape[1], 1)
     lags = [float(left[k:] @ left[:-k]) / max(float(left @ left), 1e-300) for k in range(1, LAGS + 1)]
     k = len(patterns)
-    toeplitz = np.zeros((len(means), len(means)))
+    meat = design.T @ design
     for lag, r in enumerate(lags, 1):
         if abs(r) > 3 / np.sqrt(len(means)):
-            toeplitz += r * (np.eye(len(means), k=lag) + np.eye(len(means), k=-lag))
-    meat = design.T @ design + design.T @ toeplitz @ design
+            beside = r * (design[lag:].T @ design[:-lag])
+            meat = meat + beside + beside.T
     own = np.diag(np.maximum(np.diag(inverse @ meat @ inverse), np.diag(inverse)))[:k, :k]  # never less than of independent columns
     return np.asarray(values[:k], float), np.asarray(own * var, float)
 

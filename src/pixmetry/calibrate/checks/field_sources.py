@@ -33,6 +33,7 @@ TURNED = 1e-3  # level at which a pattern that turns is no height
 SIDE = (33, 25)  # of the map that is drawn
 FINER = 0.03  # of what a partition explains, which a finer one must explain more: terms are linear
 LEAST_TOLD = 8  # images by which a fixed pattern of the camera is told from errors of single images
+SINGULAR = 1e-12  # least eigenvalue of a covariance, over its trace
 LEAST_IMAGES = 5  # whose scores show their own scatter
 
 
@@ -414,8 +415,8 @@ def _scales(camera: _Camera, others: list[Candidate]) -> ImageScales | None:
         found = camera.terms.test(np.hstack(terms), np.hstack([own, rest]))
         k = contrasts.shape[1]
         y, v = found.values[:k], found.covariance[:k, :k]
-    if not np.isfinite(v).all() or np.linalg.eigvalsh(v)[0] <= 0:
-        return None
+    if not np.isfinite(v).all() or np.linalg.eigvalsh(v)[0] <= SINGULAR * np.trace(v):
+        return None  # of an image that does not tell its scale
     weight = np.linalg.inv(v)
     chi2 = float(y @ weight @ y)
     p_differ = float(stats.f.sf(chi2 / len(y), len(y), adjustment.dof))
@@ -457,7 +458,10 @@ def _decaying(scales: ImageScales, y: np.ndarray, weight: np.ndarray, contrasts:
     covariance = np.linalg.pinv(jacobian.T @ weight @ jacobian, hermitian=True) * max(rest / free, 1.0)
     gain = (chi2 - rest) / max(rest / free, 1.0) - 2 * np.log(dof)
     to_tau = np.diag([1.0, tau])
-    return replace(scales, p_left=p_left, gain=gain, start=size, tau_s=tau, covariance=to_tau @ covariance @ to_tau)
+    return replace(
+        scales, p_left=p_left, gain=gain, start=size, tau_s=tau, covariance=to_tau @ covariance @ to_tau,
+        dof=float(free if rest > free else dof),
+    )  # fmt: skip
 
 
 def without_claims(found: FieldSources, rival: str) -> FieldSources:

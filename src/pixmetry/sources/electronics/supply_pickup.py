@@ -164,8 +164,8 @@ SOURCE = Source(
     id="electronics.supply_pickup",
     title="Supply pick-up",
     description=(
-        "The mains or a switching supply adds a sinusoid to the signal while the frame is read out pixel by pixel. and lies over "
-        "it as stripes that stand still or roll, as the supply beats with the frame rate."
+        "The mains or a switching supply adds a sinusoid to the signal while the frame is read out pixel by pixel. It lies over "
+        "the frame as stripes that stand still or roll, as the supply beats with the frame rate."
     ),
     number=21,
     held_by=("grabber.phase_pattern",),
