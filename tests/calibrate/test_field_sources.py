@@ -160,8 +160,8 @@ def test_steps_of_a_stitched_sensor(rng, layout):
     simulated = a_network(rng, images=14, points=90)
     exact = predicted(simulated.network, simulated.truth)
     col, row = (np.floor((exact + 0.5) / [SENSOR.cols, SENSOR.rows] * layout)).astype(int).T
-    steps = 0.08 * rng.standard_normal((layout[0] * layout[1], 2))
-    steps *= 0.06 / np.abs(np.diff(steps, axis=0)).min()
+    steps = rng.uniform(0.04, 0.08, (layout[0] * layout[1], 2)) * rng.choice([-1.0, 1.0], 2)
+    steps[1::2] *= -1
     found = told(rng, simulated, exact + steps[row * layout[0] + col]).seams
     assert found.found and (found.fields_x, found.fields_y) == layout
     for axis in range(2):
@@ -213,7 +213,7 @@ def camera_of(geometry) -> Camera:
 def test_a_calibration_measures_the_surface_and_positions_are_corrected_by_it(rng, tmp_path):
     """Through the files: the height is the same, camera and surface together image directions as the truth does, and u holds the error."""
     simulated = simulate(rng, images=14, points=80)
-    plain = {"bow_x_um": 5.0, "bow_y_um": -4.0, "twist_um": 2.0}
+    plain = {"bow_x_um": 15.0, "bow_y_um": -12.0, "twist_um": 6.0}
     params = a_surface(rng, simulated, 0.0).model_copy(update=plain)
     seen = met_at(predicted(simulated.network, simulated.truth), params) + NOISE_PX * rng.standard_normal((len(simulated.network), 2))
     made = pixmetry.calibrate(replace(simulated.network, x_px=seen[:, 0], y_px=seen[:, 1]), tmp_path / "out", options={"folds": 0})
@@ -243,7 +243,7 @@ def test_a_calibration_measures_the_surface_and_positions_are_corrected_by_it(rn
         left.append((error, np.sqrt(back.correction_px2[:, [0, 2]])))
     (with_it, u_px), (without, _) = left
     rms, rms_without, rms_u = (np.sqrt(np.mean(part**2)) for part in (with_it, without, u_px))
-    assert rms < 0.3 * rms_without and rms < 1.5 * rms_u
+    assert rms < 0.5 * rms_without and rms < 1.5 * rms_u
 
 
 def test_what_the_residuals_do_not_tell_has_a_reason(rng):
