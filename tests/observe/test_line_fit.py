@@ -136,6 +136,7 @@ def test_what_cannot_be_told_apart_is_named_and_its_delay_is_given(rng: np.rando
         try:
             for e in measured(source, seen):
                 assert abs(e.value - truth[e.name]) < LIMIT * e.u, e
+                assert e.name != "damping" or e.u > 0.01, e  # 0.006 without an echo, which may hide behind the rise and change it by 0.3
         except MeasureError as why:
             assert "the whole line delays by" in str(why)
     with pytest.raises(MeasureError, match=r"do not need it|not separable|hardly tell"):

@@ -8,7 +8,7 @@ that nothing comes before its cause, part the two.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from itertools import product
@@ -224,7 +224,7 @@ class _Seen:
 
 @dataclass(frozen=True)
 class LineFit:
-    """A fit of one model: optics, line parameters, and for each curve place, lower level and height."""
+    """A fit of one model: optics, line parameters, and for each curve place, lower level and height; what was held has no covariance."""
 
     model: LineModel
     optics: Array
@@ -234,6 +234,7 @@ class LineFit:
     covariance: Array  # of the free optics, then of the line's parameters
     chi2: float
     dof: int
+    held: tuple[str, ...] = ()  # of the line
 
     @property
     def occam(self) -> float:
@@ -241,9 +242,11 @@ class LineFit:
 
         Frequencies, damping and delays are taken as log-uniform, the rest as uniform, over the ranges in which they are looked for.
         """
-        _, log_det = np.linalg.slogdet(self.covariance)
+        names = [name for name in self.model.names if name not in self.held]
+        fitted = [*range(len(self.free)), *(len(self.free) + self.model.names.index(name) for name in names)]
+        _, log_det = np.linalg.slogdet(self.covariance[np.ix_(fitted, fitted)])
         optics = OPTICS_HIGHEST[list(self.free)] - OPTICS_LOWEST[list(self.free)]
-        line = [self.model.prior_width(name, self.line[name]) for name in self.model.names]
+        line = [self.model.prior_width(name, self.line[name]) for name in names]
         ranges = np.concatenate([optics, line])
         return float(2 * np.log(ranges).sum() - log_det - len(ranges) * np.log(2 * np.pi))
 
@@ -256,20 +259,21 @@ def fit_model(
     line: dict[str, float],
     own: Array,
     iterations: int = ITERATIONS,
+    held: tuple[str, ...] = (),
 ) -> LineFit:
-    """Levenberg–Marquardt from a start; derivatives of the spectra by differences."""
-    names = model.names
+    """Levenberg–Marquardt from a start; derivatives of the spectra by differences. Parameters of the line that are held stay as they are."""
+    names = [name for name in model.names if name not in held]
     k, n = len(free), len(free) + len(names)
     limits = np.array([model.limits(name) for name in names]).reshape(-1, 2)
     lows = np.concatenate([OPTICS_LOWEST[list(free)], limits[:, 0]])
     highs = np.concatenate([OPTICS_HIGHEST[list(free)], limits[:, 1]])
 
     def normal(p: Array, q: Array, own: Array) -> tuple[float, list[tuple[Array, Array]]]:
-        values = dict(zip(names, q, strict=True))
+        values = line | dict(zip(names, q, strict=True))
         taps = [model.taps_read(values)]
-        for name, value in values.items():
-            step = STEP_REL * max(abs(value), 0.1)
-            taps.append((model.taps_read(values | {name: value + step}) - taps[0]) / step)
+        for name in names:
+            step = STEP_REL * max(abs(values[name]), 0.1)
+            taps.append((model.taps_read(values | {name: values[name] + step}) - taps[0]) / step)
         chi2, parts = 0.0, []
         for s, (place, low, height) in zip(seen, own, strict=True):
             nu = _frequencies()
@@ -307,11 +311,11 @@ def fit_model(
         reduced, right = reduced / np.outer(scale, scale), right / scale
         now = np.concatenate([p[list(free)], q])
         step = np.linalg.lstsq(reduced, right, rcond=1e-12)[0] / scale
-        held = (now + step < lows) | (now + step > highs)
-        if held.any():  # these go to their limits, the others as is best with that
+        stopped = (now + step < lows) | (now + step > highs)
+        if stopped.any():  # these go to their limits, the others as is best with that
             step = np.clip(now + step, lows, highs) - now
-            rest = right - reduced[:, held] @ (step * scale)[held]
-            step[~held] = np.linalg.lstsq(reduced[np.ix_(~held, ~held)], rest[~held], rcond=1e-12)[0] / scale[~held]
+            rest = right - reduced[:, stopped] @ (step * scale)[stopped]
+            step[~stopped] = np.linalg.lstsq(reduced[np.ix_(~stopped, ~stopped)], rest[~stopped], rcond=1e-12)[0] / scale[~stopped]
         # no parameter more than doubles or falls below a half in one step
         trial = np.clip(now + np.clip(step, -0.5 * np.abs(now) - 0.02, np.abs(now) + 0.02), lows, highs)
         taken = trial - now
@@ -339,8 +343,11 @@ def fit_model(
     scale = np.sqrt(np.diag(information))
     covariance = np.linalg.pinv(information / np.outer(scale, scale), rcond=1e-10, hermitian=True) / np.outer(scale, scale)
     dof = sum(len(s.curve.value) for s in seen) - n - 3 * len(seen)
-    line = dict(zip(names, map(float, q), strict=True))
-    return LineFit(model, p, tuple(free), line, own, np.asarray(covariance, float), chi2, max(dof, 1))
+    line = {name: line[name] for name in model.names} | dict(zip(names, map(float, q), strict=True))
+    fitted = [*range(k), *(k + model.names.index(name) for name in names)]
+    whole = np.zeros((k + len(line), k + len(line)))
+    whole[np.ix_(fitted, fitted)] = covariance
+    return LineFit(model, p, tuple(free), line, own, whole, chi2, max(dof, 1), held)
 
 
 def _of_others(p: Array) -> float:
@@ -355,6 +362,9 @@ TRIAL_ITERATIONS = 7
 SURVIVING = 1e-4  # probability of a model over that of the best, below which it is left out of the mean
 CERTAIN = 0.99  # probability that is enough to speak of a part or a kind as known
 STARTS_D = (0.6, 1.1)
+VALLEY_DELAYS_PX = np.geomspace(0.1, NEAR_PX, 6)  # of an echo within the rise of an edge
+VALLEY_STEP, VALLEY_LEAST, VALLEY_CHANGE = 0.02, 1e-3, (1.0, 4.0)  # of its ghost; by how much χ² may change with one
+VALLEY_RISE = 16.0  # of χ², where it ends
 WORDS = {
     "grabber.low_pass": "low-pass filter",
     "electronics.video_amplifier": "video amplifier",
@@ -377,6 +387,11 @@ class LineSearch:
     scale: float
     misfit_p: float
     jitter_px: float  # standard deviation of the rows' places
+    valleys: tuple[tuple[LineFit, tuple[tuple[LineFit, float], ...]], ...] = ()  # of a fit: fits along its valley, and their shares
+
+    def spread_of(self, fit: LineFit) -> tuple[tuple[LineFit, float], ...]:
+        """Fits that stand for one with all that its model may be, and their shares."""
+        return next((along for own, along in self.valleys if own is fit), ((fit, 1.0),))
 
     @cached_property
     def weights(self) -> tuple[tuple[LineFit, float], ...]:
@@ -465,7 +480,58 @@ def search_models(curves: Sequence[EdgeCurve]) -> LineSearch | None:
     least = min(found, key=lambda f: f.chi2)
     misfit_p = float(gammaincc(least.dof / 2, least.chi2 / 2))
     jitter = float(np.sqrt(max(c.jitter_px2 for c in curves)))
-    return LineSearch(tuple(found), max(least.chi2 / least.dof, 1.0), misfit_p, jitter)
+    search = LineSearch(tuple(found), max(least.chi2 / least.dof, 1.0), misfit_p, jitter)
+    return replace(search, valleys=tuple(_valleys(seen, search)))
+
+
+def _valleys(seen: Sequence[_Seen], found: LineSearch) -> Iterator[tuple[LineFit, tuple[tuple[LineFit, float], ...]]]:
+    """Of each probable model with an echo within the rise of an edge that χ² does not need: all such echoes, by their probability.
+
+    A ghost g after a delay d widens a step by g d² and no more where d is short: what fits is a long curved valley in g and d, at whose
+    bottom filter and amplifier change with g. Laplace's method at its lowest point knows nothing of its length. So χ² is followed from
+    g = 0 outwards at each of some delays, evenly spaced in their logarithm, with all else fitted. Points weigh by likelihood, by the share
+    of the prior that is left to the rest (Laplace), and by the length of the step.
+    """
+    probable: dict[LineModel, LineFit] = {}
+    for fit, _ in found.weights:
+        probable.setdefault(fit.model, fit)
+    for fit in probable.values():
+        bare = min((f for f in found.fits if f.model == replace(fit.model, echo="")), key=lambda f: f.chi2, default=None)
+        if fit.model.echo != "near" or bare is None or bare.chi2 - fit.chi2 > FOUND_CHI2 * found.scale:
+            continue
+        points = [p for delay in map(float, VALLEY_DELAYS_PX) for p in _along_ghost(seen, fit.model, bare, delay, found.scale)]
+        costs = np.array([p.chi2 / found.scale + p.occam for p, _ in points])
+        shares = np.exp(-0.5 * (costs - costs.min())) * np.array([length for _, length in points])
+        yield fit, tuple((p, float(share)) for (p, _), share in zip(points, shares / shares.sum(), strict=True))
+
+
+def _along_ghost(seen: Sequence[_Seen], model: LineModel, bare: LineFit, delay: float, scale: float) -> list[tuple[LineFit, float]]:
+    """Fits with ghosts from 0 to both sides until χ² excludes them, and the length of ghosts that each stands for."""
+    held = ("ghost_rel", "echo_px")
+
+    def moved(fit: LineFit, ghost: float) -> LineFit:
+        line = fit.line | {"ghost_rel": ghost, "echo_px": delay}
+        later = model.delay_px(line) - fit.model.delay_px(fit.line)
+        own = fit.own.copy()
+        own[:, 0] += [-later if s.main == 0 else s.curve.slope * later for s in seen]
+        return fit_model(seen, model, fit.optics, fit.free, line, own, TRIAL_ITERATIONS, held)
+
+    start = moved(bare, 0.0)
+    found = [start]
+    for sign, limit in zip((-1, 1), model.limits("ghost_rel"), strict=True):
+        fit, step = start, VALLEY_STEP
+        while abs(fit.line["ghost_rel"]) < abs(limit) and fit.chi2 - start.chi2 < VALLEY_RISE * scale:
+            ghost = float(np.clip(fit.line["ghost_rel"] + sign * step, -abs(limit), abs(limit)))
+            after = moved(fit, ghost)
+            change = abs(after.chi2 - fit.chi2) / scale
+            if change > VALLEY_CHANGE[1] and step > VALLEY_LEAST:
+                step /= 2
+                continue
+            found.append(after)
+            fit, step = after, 2 * step if change < VALLEY_CHANGE[0] else step
+    found.sort(key=lambda f: f.line["ghost_rel"])
+    length = np.gradient([f.line["ghost_rel"] for f in found]) if len(found) > 1 else np.ones(1)
+    return list(zip(found, map(float, length), strict=True))
 
 
 def _start_variance(curves: Sequence[EdgeCurve]) -> float:
@@ -499,7 +565,8 @@ def _search(seen: Sequence[_Seen], optics: Array, free: Sequence[int]) -> list[L
                 continue
             before = next((f.line for f in out if f.model == replace(model, echo="")), None)
             tried = _from_starts(seen, model, optics, before, own)
-            out += _distinct([go_on(fit) for fit in tried[: 3 if echo == "far" else 1]])
+            exchanged = model.order and model.amplifier and echo in ("", "near")  # a filter and an amplifier can change places
+            out += _distinct([go_on(fit) for fit in tried[: 3 if echo == "far" else 2 if exchanged else 1]])
     least = min(f.chi2 for f in out)
     for fit in [f for f in out if f.chi2 - least < FAR_CHI2 * max(least / f.dof, 1.0)]:  # each without one of its parts, from where it is
         for less in _parts_left_out(fit.model):
@@ -563,7 +630,8 @@ def line_estimates(found: LineSearch) -> tuple[Estimates, Estimates]:
     -----
     Values are means over the models, weighted by their probabilities (χ² and the share of the prior range that is left, by Laplace's
     method), their covariance Σ w (C + d dᵀ) with d from the mean (J. A. Hoeting et al., Statistical Science 14, 1999, 382). So what
-    another part could hide is in u.
+    another part could hide is in u. A model with an echo within the rise of an edge, which the edges do not need, counts by all echoes
+    that fit (`_valleys`).
     """
     if found.misfit_p < MISFIT_P:
         best = found.best
@@ -616,7 +684,8 @@ NEEDED = "take the same edges with the filter of the grabber switched off"
 def _mean_of_models(found: LineSearch, names: Sequence[str]) -> tuple[Array, Array]:
     """Mean and covariance of (free optics, σ, these parameters, delay) over the models."""
     each, covariances, weights = [], [], []
-    for fit, weight in found.weights:
+    spread = [(f, weight * share) for fit, weight in found.weights for f, share in found.spread_of(fit)]
+    for fit, weight in spread:
         if not set(names) <= set(fit.model.names):  # improbable: a part that is told is in all rivals
             continue
         value, jacobian = _values(fit, names)
