@@ -261,7 +261,7 @@ def fit_model(
     iterations: int = ITERATIONS,
     held: tuple[str, ...] = (),
 ) -> LineFit:
-    """Levenberg–Marquardt from a start; derivatives of the spectra by differences. Parameters of the line that are held stay as they are."""
+    """Levenberg–Marquardt from a start; derivatives of the spectra by differences. What is held of the line stays as it is."""
     names = [name for name in model.names if name not in held]
     k, n = len(free), len(free) + len(names)
     limits = np.array([model.limits(name) for name in names]).reshape(-1, 2)
