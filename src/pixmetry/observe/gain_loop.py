@@ -211,6 +211,36 @@ def _model(names: tuple[str, ...], values: np.ndarray, data: LoopData, delay: in
     return out
 
 
+def _slopes(names: tuple[str, ...], values: np.ndarray, data: LoopData, delay: int, gaps: tuple[int, ...]) -> np.ndarray:
+    """Derivatives of `_model` by its parameters, shape (frames, parameters)."""
+    at = {name: i for i, name in enumerate(names)}
+    path = _path(names, values, data, delay, gaps)
+    out = np.zeros((len(path), len(names)))
+    out[0, at["start"]] = 1.0
+    free = {k: at[f"gap {k}"] for k in gaps}
+    ends = [(values[at[name]], at[name]) for name in ("lowest", "highest") if name in at]
+    for k in range(len(path) - 1):
+        out[k + 1] = out[k]
+        if k in free:
+            out[k + 1, free[k]] += 1.0
+        else:
+            out[k + 1, at["push"]] += 1.0
+            out[k + 1, at["kappa"]] -= data.log_level[k - delay + 1]
+        for end, i in ends:
+            if path[k + 1] == end:
+                out[k + 1] = 0.0
+                out[k + 1, i] = 1.0
+    if "cosine" in at:
+        c, s, f = (values[at[n]] for n in WAVE)
+        angle = 2 * np.pi * f * data.place
+        wave = c * np.cos(angle) + s * np.sin(angle)
+        inside = np.where(wave > -0.99, 1 / (1 + np.maximum(wave, -0.99)), 0.0)
+        out[:, at["cosine"]] = np.cos(angle) * inside
+        out[:, at["sine"]] = np.sin(angle) * inside
+        out[:, at["per_frame"]] = 2 * np.pi * data.place * (s * np.cos(angle) - c * np.sin(angle)) * inside
+    return out
+
+
 def _fit(data: LoopData, names: tuple[str, ...], delay: int, gaps: tuple[int, ...], start: dict[str, float]) -> LoopFit:
     """Least squares of start, κ and push with the parameters named; ``start`` holds values to begin with."""
     from scipy.optimize import least_squares
@@ -223,7 +253,10 @@ def _fit(data: LoopData, names: tuple[str, ...], delay: int, gaps: tuple[int, ..
     def left(values: np.ndarray) -> np.ndarray:
         return np.asarray((_model(every, values, data, delay, gaps) - data.log_gain) * root)
 
-    found = least_squares(left, first, x_scale=scale, method="trf", max_nfev=200)
+    def slopes(values: np.ndarray) -> np.ndarray:
+        return np.asarray(_slopes(every, values, data, delay, gaps) * root[:, None])
+
+    found = least_squares(left, first, slopes, x_scale=scale, method="trf", max_nfev=200)
     frames = len(data.u)
     chi2, dof = float(2 * found.cost), max(frames - len(every), 1)
     scatter = float(np.sqrt(max(chi2 / dof, 1.0)))

@@ -34,6 +34,7 @@ MOVES = 5.0  # u beyond which gains, and the black, are said to move
 BLACK_CHANCE = 1e-4
 METHOD = "factor of each frame on what does not change in the scene, over the means of the frames before it"
 SWITCH_GAIN = "take 40 frames or more in a row in which a bright patch, a quarter of the frame, comes and goes every 7 to 20 frames"
+WHOLE_FRAME = "of the mean of these frames; a loop that weighs the middle more, or sees more than this window, has its own target"
 NO_ORDER = "list the frames in the order in which they were taken"
 
 
@@ -597,6 +598,7 @@ def loop_of_all(found: Sequence[FrameSequence], refused: Sequence[str], seen: Ob
     value, covariance, dof, reasons = mean_of_loops([s.loop for s in moving])
     if value[0] > 1:
         return replace(Estimates.empty(), reasons={"kappa": f"the loop overshoots, κ = {value[0]:.3g}: the source describes 0 to 1"})
+    reasons = {"target_dn": WHOLE_FRAME, **reasons}
     confounders = tuple(dict.fromkeys(c for s in moving for c in s.loop.confounders))
     joint = Estimates(("kappa", "target_dn"), value, covariance, dof, ("1", "DN"), METHOD, confounders, reasons=reasons)
     return joint.join(_limits_db(moving, seen))
