@@ -20,7 +20,7 @@ class LampWave:
     per_frame, u_per_frame : float
         Cycles from frame to frame, 0 to ½ where the rows show nothing, else −½ to ½: whole cycles between frames are not seen.
     per_row, u_per_row : float
-        Cycles from row to row, 0 to ½; 0 where all rows see the same light.
+        Cycles from row to row, 0 to ½; 0 where all rows see the same light, ½ where odd and even rows are two fields.
     phase_turns : float
         At frame 0 and row 0, of a cosine.
     """
@@ -32,6 +32,11 @@ class LampWave:
     per_row: float = 0.0
     u_per_row: float = 0.0
     phase_turns: float = 0.0
+
+    @property
+    def of_fields(self) -> bool:
+        """Whether odd rows see other light than even ones."""
+        return self.per_row == 0.5
 
     def light(self, place: np.ndarray, row: np.ndarray) -> np.ndarray:
         """Light over its mean, shape (frames, rows), of frames taken at ``place`` (in frame times)."""

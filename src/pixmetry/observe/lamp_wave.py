@@ -76,11 +76,27 @@ def row_wave(
         return None
     if start is not None:
         return _refined(value, place, row, start.per_frame, start.per_row)
-    found = strongest_wave(value, place, row, hum_per_row)
+    fields, found = wave_of_fields(value, row), strongest_wave(value, place, row, hum_per_row)
+    if fields is not None and (found is None or 2 * fields.amplitude_rel > found.amplitude_rel):
+        return fields
     if found is None:
         return None
     parts = [light_of_rows(rows, mean, gain, offset, black, static & part) for part in _across(static, rows)]
     return found if _is_alike(found, parts, place) else None
+
+
+def wave_of_fields(value: np.ndarray, row: np.ndarray) -> LampWave | None:
+    """Light that goes up and down from row to row, as in two fields that saw the lamp at two times; None where none stands out.
+
+    The mean over the rows with alternating signs has, of noise, a χ² of one degree of freedom in each frame.
+    """
+    from scipy.special import chdtrc
+
+    mean = value @ (1.0 - 2.0 * (row % 2)) / len(row)
+    noise = float(np.median(value**2)) / 0.4549 / len(row)
+    if chdtrc(len(value), float((mean**2).sum()) / max(noise, ROUNDING**2)) > CHANCE:
+        return None
+    return LampWave(float(np.sqrt(2 * np.mean(mean**2))), float(np.sqrt(2 * noise / len(value))), 0.0, 0.5, 0.5)
 
 
 def strongest_wave(value: np.ndarray, place: np.ndarray, row: np.ndarray, hum_per_row: float = 0.0) -> LampWave | None:
@@ -197,7 +213,7 @@ def lamp_estimates(found: Sequence[FrameSequence], refused: Sequence[str], seen:
 
     if not found:
         return replace(Estimates.empty(), reasons={"depth_rel": refused[0] if refused else "no sequence"})
-    lit = [s for s in found if s.wave is not None and not _is_of_fields(s.wave)]
+    lit = [s for s in found if s.wave is not None and not s.wave.of_fields]
     if not lit:
         woven = any(s.wave is not None for s in found)
         return replace(Estimates.empty(), reasons={"depth_rel": WOVEN}) if woven else _limit_of(found)
@@ -234,11 +250,6 @@ def lamp_estimates(found: Sequence[FrameSequence], refused: Sequence[str], seen:
     covariance = np.array([[u * u, cross], [cross, u_hertz**2]])
     dof = np.array([max(2.0 * len(best.gain_rel), 1.0), np.inf])
     return Estimates(("depth_rel", "frequency_hz"), values, covariance, dof, ("1", "Hz"), METHOD, tuple(confounders), reasons=reasons)
-
-
-def _is_of_fields(wave: LampWave) -> bool:
-    """Whether a wave goes up and down from row to row, as two fields do that saw different light."""
-    return 0.5 - wave.per_row < 4 * wave.u_per_row + 1e-4
 
 
 def _limit_of(found: Sequence[FrameSequence]) -> Estimates:

@@ -166,7 +166,8 @@ def sequence_of(group: PictureGroup, dark: tuple[float, float] | None, order: np
     blocks = np.array([sums.blocks[i] for i in order]).reshape(count, -1)
     place, gaps, interval = _places(group, order)
     row_means = np.array([sums.rows[i] for i in order])
-    bands = _bands(row_means, blocks, usable, sums.blocks[0].shape, place, dark, hum_per_row)
+    wave = _bands(row_means, blocks, usable, sums.blocks[0].shape, place, dark, hum_per_row)
+    bands = None if wave is None or wave.of_fields else wave  # blocks hold as many odd rows as even ones
     if bands is not None and dark is not None:
         light = bands.light(place, np.arange(row_means.shape[1]))
         blocks = dark[0] + (blocks - dark[0]) / _by_block(light, sums.blocks[0].shape)
@@ -221,7 +222,7 @@ def sequence_of(group: PictureGroup, dark: tuple[float, float] | None, order: np
         gain_share=share,
         u_gain_share=u_share,
         black_moves_dn=moves,
-        wave=bands or _wave_of(fit),
+        wave=wave or _wave_of(fit),
         loop=loop,
         notes=(*notes, *more),
     )
@@ -253,7 +254,9 @@ def _bands(
     for _ in range(MOST_ROUNDS):
         found = _factors(free, about)
         before, wave = wave, row_wave(rows, mean, found.gain, found.offset, black, about.reshape(shape), place, wave, hum_per_row)
-        if wave is None or (before is not None and abs(wave.amplitude_rel - before.amplitude_rel) < 0.1 * wave.u_amplitude_rel):
+        if wave is None or wave.of_fields:
+            return wave
+        if before is not None and abs(wave.amplitude_rel - before.amplitude_rel) < 0.1 * wave.u_amplitude_rel:
             break
         if dark is None:
             raise MeasureError("the light makes bands over the rows, and black is not known", remedy="add dark frames (kind: dark)")

@@ -368,7 +368,8 @@ def _marginal(series: Series, fits: Sequence[Fit], scatter: Array) -> Fit:
     """The best fit, with the covariance about it of all curves of a camera by their probability.
 
     The curve is linear in all but its time constants and their share. Those are drawn about each minimum of χ² and from the prior; what is
-    linear is integrated in closed form; draws weigh by likelihood × prior over the density that they were drawn from (importance sampling).
+    linear is solved in closed form; draws weigh by its best likelihood × prior over the density that they were drawn from (importance
+    sampling). Integrated over, a flat prior of the amplitudes would favour the time constants that tell least of them.
     """
     best = min(fits, key=lambda one: one.chi2)
     names, white = best.names, _whitening(series, scatter)
@@ -392,7 +393,7 @@ def _marginal(series: Series, fits: Sequence[Fit], scatter: Array) -> Fit:
         inverse = np.linalg.pinv((by / size).T @ (by / size), hermitian=True)
         one[linear] = inverse @ ((by / size).T @ left) / size
         inside[k] = inverse / size / size[:, None]
-        log_weight[k] = -0.5 * float(((left - by @ one[linear]) ** 2).sum()) + 0.5 * np.linalg.slogdet(inverse)[1] - np.log(size).sum()
+        log_weight[k] = -0.5 * float(((left - by @ one[linear]) ** 2).sum())
     log_weight += stats.multivariate_normal.logpdf(draws, centre, prior) - np.log(density)
     weight = np.exp(log_weight - log_weight.max())
     weight /= weight.sum()
