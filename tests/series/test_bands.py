@@ -88,6 +88,15 @@ def test_a_filter_is_told_by_light_with_and_without_it(rng: np.random.Generator)
     assert told["plate_um"].value == pytest.approx(4 * 4 * 5 * 1.52 / 0.52 * np.sqrt(0.28), rel=0.1)
 
 
+def test_a_saturated_band_takes_no_part_in_the_thickness_of_a_filter(rng: np.random.Generator) -> None:
+    bands = [(frames_of(rng, light=light), nm, {"filtered": f}) for nm in (500.0, 600.0) for f, light in ((False, 2400.0), (True, 2000.0))]
+    bands[3] = (frames_of(rng, light=9000.0), *bands[3][1:])
+    told = measure_sources(observed(*bands, f_number=4.0))[0]["optics.spectral_filter"]
+    assert np.isfinite(told.values).all() and told["plate_um"].value < 100
+    full = [(frames_of(rng, light=9000.0), 500.0, {"filtered": f}) for f in (False, True)]
+    assert "below saturation" in measure_sources(observed(*full, f_number=4.0))[1]["optics.spectral_filter"]
+
+
 def test_diffusion_is_told_where_the_lens_was_focused_anew(rng: np.random.Generator) -> None:
     more = float(np.interp(10.0, [7.0, 12.0], _blur_by_diffusion(850.0, RADIUS, 0.6, (5.0, 5.0))[[3, 4]]))
     blurred = frames_of(rng, blur=float(np.sqrt(0.36 + more)))

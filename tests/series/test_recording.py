@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 from scipy.signal import bessel
@@ -14,6 +16,7 @@ from pixmetry.camera.group_facts import GroupFacts
 from pixmetry.core.errors import MeasureError
 from pixmetry.core.progress import no_progress
 from pixmetry.files.in_memory import Frames
+from pixmetry.series import job
 from pixmetry.series.recording import bessel_gain, group_of, recordings_of
 from pixmetry.sources.storage.video_codec import Coder, VideoCodec
 
@@ -78,6 +81,27 @@ def test_what_is_no_recording_of_the_scene_is_refused(rng: np.random.Generator) 
         recordings_of(seen(scene, 12, rng), seen(scene, 3, rng))
     with pytest.raises(MeasureError, match="another scene"):
         recordings_of(seen(scene, 8, rng), seen(scene[::-1, ::-1].T[: SHAPE[0]].repeat(2, axis=1)[:, : SHAPE[1]], 8, rng))
+
+
+def test_of_large_frames_the_middle_is_kept_from_the_border_of_a_block_on(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(job, "RECORDED_SIDE", 128)
+    frames = rng.integers(0, 40, (8, 200, 300), dtype=np.uint8) + (np.indices((200, 300)).sum(axis=0) % 200).astype(np.uint8)
+    found = []
+    for part in (frames, np.pad(frames[:, 32:160, 80:208], ((0, 0), (32, 40), (80, 92)))):
+        fetch = [partial(part.__getitem__, k) for k in range(8)]
+        found.append(job.measure_recordings(fetch, fetch, analogue=False, bits=8))
+    assert len(found[0].step_px) == 128
+    np.testing.assert_array_equal(found[0].difference_dn2, found[1].difference_dn2)
+
+
+def test_frames_without_noise(rng: np.random.Generator) -> None:
+    """Copies of one picture tell nothing; a recorder that freezes the picture altogether loses its noise."""
+    scene = texture(rng)
+    copies = [scene.astype(np.uint8)] * 8
+    with pytest.raises(MeasureError, match="copies of one picture"):
+        recordings_of(copies, seen(scene, 8, rng))
+    fit = recordings_of(seen(scene, 8, rng), copies, depth_bits=12).fit
+    assert fit["noise_ratio"].value == 0 and "more than 10 bits" in fit.reasons["quality"]
 
 
 def test_the_gain_of_the_filter_is_that_of_scipy() -> None:

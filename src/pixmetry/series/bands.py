@@ -132,7 +132,8 @@ def bands_of(bands: Sequence[Band], frame_shape: tuple[int, int], stated: Stated
         notes.append("some bands state no exposure: light is not compared")
     found = _filter(through, nm, filtered, blur, u_blur, stated, any(b.refocused for b in shown))
     per_um = None if stated.f_number is None or stated.pitch_x_um is None else 4 * stated.f_number * stated.pitch_x_um
-    focus = np.full(len(shown), np.nan) if per_um is None else per_um * np.sqrt(np.maximum(blur - np.nanmin(blur), 0.0))
+    sharp = np.min(blur[np.isfinite(blur)], initial=np.inf)
+    focus = np.full(len(shown), np.nan) if per_um is None else per_um * np.sqrt(np.maximum(blur - sharp, 0.0))
     return ColourBands(
         wavelength_nm=nm, filtered=filtered, names=tuple(b.name for b in shown), frames=np.array([len(b.frames) for b in shown]),
         targets=np.array([max(len(f.positions_px) for f in b.frames) for b in shown]), level_dn_per_s=level, u_level_dn_per_s=u_level,
@@ -232,7 +233,7 @@ def _filter(through: Array, nm: Array, filtered: np.ndarray, blur: Array, u_blur
     if not filtered.any():
         return replace(Estimates.empty(), reasons={"peak_rel": "no band is stated as filtered (filtered: true)"})
     if not through.shape[1]:
-        why = "no wavelength is seen both with the filter and without it, at a stated exposure"
+        why = "no wavelength is seen both with the filter and without it, by targets below saturation and at a stated exposure"
         return replace(Estimates.empty(), reasons={"peak_rel": why})
     at, value, u = through
     best = int(np.argmax(value))
@@ -256,7 +257,10 @@ def _plate(nm: Array, filtered: np.ndarray, blur: Array, u: Array, stated: State
     """Thickness of a plate of index 1.52 with which the lens was not focused, from the blur with it less that without it."""
     if stated.f_number is None or stated.pitch_x_um is None:
         return replace(Estimates.empty(), reasons={"plate_um": "needs f_number and pitch_um"})
-    pairs = [(k, j) for k in np.flatnonzero(filtered) for j in np.flatnonzero(~filtered) if abs(nm[k] - nm[j]) < 0.5]
+    seen = np.isfinite(blur) & np.isfinite(u)
+    pairs = [(k, j) for k in np.flatnonzero(filtered & seen) for j in np.flatnonzero(~filtered & seen) if abs(nm[k] - nm[j]) < 0.5]
+    if not pairs:
+        return replace(Estimates.empty(), reasons={"plate_um": "no wavelength has two unsaturated targets with the filter and without it"})
     weight = np.array([1 / (u[k] ** 2 + u[j] ** 2) for k, j in pairs])
     more = float(np.array([blur[k] - blur[j] for k, j in pairs]) @ weight / weight.sum())
     u_more = float(weight.sum() ** -0.5)

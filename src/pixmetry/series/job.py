@@ -37,6 +37,7 @@ from pixmetry.series.warm_up import drift_of
 
 KIND = "series"
 MOST_RECORDED = 40  # frames in memory
+RECORDED_SIDE, BLOCK_PX = 1024, 16  # of the part of larger frames that tells of a coder; of its blocks, which must not be cut
 TEXTURE = "texture"
 Fetch = Callable[[], np.ndarray]
 
@@ -327,6 +328,8 @@ def measure_recordings(
 ) -> Recordings:
     """Measure a recorder by frames of one scene, directly and recorded, given as functions that return them; the first 40 of each are used.
 
+    Of larger frames from a digital camera the middle part of 1024 × 1024 pixels is kept in memory.
+
     Raises
     ------
     MeasureError
@@ -337,11 +340,17 @@ def measure_recordings(
         frame = fetch()
         if on_frames is not None:
             on_frames(1)
-        return frame
+        return frame if analogue else frame[tuple(_middle(n) for n in frame.shape)].copy()
 
     frames = [[work(fetch) for fetch in part] for part in (direct[:MOST_RECORDED], recorded[:MOST_RECORDED])]
     with single_threaded_blas():
         return recordings_of(*frames, analogue=analogue, depth_bits=bits)
+
+
+def _middle(pixels: int) -> slice:
+    """The part of an axis that is kept, from the border of a block on."""
+    first = max(pixels - RECORDED_SIDE, 0) // 2 // BLOCK_PX * BLOCK_PX
+    return slice(first, first + RECORDED_SIDE)
 
 
 def write_results(found: Series, output: str | Path, of: Sequence[str], inputs: Iterable[Path]) -> Path:

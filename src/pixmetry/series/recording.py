@@ -69,13 +69,16 @@ def recordings_of(
     Raises
     ------
     MeasureError
-        With fewer than eight frames of each.
+        With fewer than eight frames of each, of two scenes, or where the direct frames are all the same.
     """
     if min(len(direct), len(recorded)) < LEAST_FRAMES:
         what = f"{len(direct)} frames came directly and {len(recorded)} were recorded, {LEAST_FRAMES} of each are needed"
         raise MeasureError(what, where="recording", remedy="take more frames of the same scene, which does not move")
     before, after = (np.array(frames, np.float32) for frames in (direct, recorded))
     squares = [0.5 * np.square(np.diff(f, axis=0)).mean(axis=(1, 2), dtype=float) for f in (before, after)]
+    if not squares[0].any():
+        remedy = "store the frames as they come from the camera, each taken by itself"
+        raise MeasureError("the direct frames are copies of one picture, without noise", where="recording", remedy=remedy)
     noise, correlation = _noise(before, after)
     means = (before.mean(axis=0, dtype=float), after.mean(axis=0, dtype=float))
     _same_scene(*means)
