@@ -83,7 +83,7 @@ def test_what_is_no_recording_of_the_scene_is_refused(rng: np.random.Generator) 
         recordings_of(seen(scene, 8, rng), seen(scene[::-1, ::-1].T[: SHAPE[0]].repeat(2, axis=1)[:, : SHAPE[1]], 8, rng))
 
 
-def test_of_large_frames_the_middle_is_kept_from_the_border_of_a_block_on(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_of_large_frames_the_middle_is_kept_from_the_border_of_a_block(rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(job, "RECORDED_SIDE", 128)
     frames = rng.integers(0, 40, (8, 200, 300), dtype=np.uint8) + (np.indices((200, 300)).sum(axis=0) % 200).astype(np.uint8)
     found = []
