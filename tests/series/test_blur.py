@@ -85,6 +85,15 @@ def test_without_a_stated_exposure_the_length_is_told_but_enters_no_camera(rng: 
     assert "state exposure_s" in measure_sources(seen)[1]["sensor.exposure"]
 
 
+def test_a_run_at_rest_needs_no_stated_exposure_but_all_that_move_do(rng: np.random.Generator) -> None:
+    moving = runs_of(rng, 0.02, (RIGHT,), 4)
+    rest, down = (runs_of(rng, 0.02, (v,), 4, stated_s=0.0) for v in (AT_REST, DOWN))
+    seen = measured([*rest, *moving])
+    length = get_source("sensor.exposure").measure(seen)["length_rel"]
+    assert abs(length.value - 1) < 6 * length.u
+    assert "state it for all" in measured([*rest, *moving, *down]).motion.fit.reasons["exposure_s"]
+
+
 def test_what_frames_do_not_tell_of_the_exposure(rng: np.random.Generator) -> None:
     one_blur = measured(runs_of(rng, 0.01, (RIGHT, LEFT), frames=4)).motion.fit
     assert "blurred alike" in one_blur.reasons["exposure_s"] and "exposure_s" not in one_blur

@@ -229,11 +229,13 @@ def _exposure(parts: Sequence[_Followed], rows: Estimates) -> tuple[Estimates, f
         return untold(NOTHING_MOVES), 0.0
     if not any(p.cuts for p in parts):
         return untold("the frames themselves are needed, not only places"), 0.0
-    stated = [p.run.exposure_s for p in parts]
-    longest = max(stated) if min(stated) > 0 else 0.0
+    stated = [p.run.exposure_s for p in parts if _moves([p])] or [0.0]
+    longest = max(stated)
+    if longest > 0 >= min(stated):
+        return untold("some runs state their exposure_s and others do not, and may differ: state it for all that move"), 0.0
     looks: dict[int, list[Look]] = {}
     for part, own in zip(parts, _known_again(parts), strict=True):
-        share = part.run.exposure_s / longest if longest else 1.0
+        share = part.run.exposure_s / longest if longest and part.run.exposure_s else 1.0  # without one, a run at rest
         for i, pairs in _looks(part).items():
             if i in own:
                 both = [look for pair in pairs for look in pair]
