@@ -112,6 +112,9 @@ def test_one_over_f_noise_is_found_and_taken_off_white_and_row_noise(rng: np.ran
     rows = told["electronics.row_noise"]["row_e"]
     assert rows.value * GAIN < 1.2  # 2.7 DN are in the means of the rows
     assert abs(told["electronics.gain"]["gain_dn_per_e"].value / GAIN - 1) < 0.02
+    assert "line_px" not in found.reasons
+    unclocked = measure_sources(seen_of(rng, flicker_dn=3.0, stack=8, facts={}))[0]["electronics.flicker_noise"]
+    assert "state camera.line_time_us" in unclocked.reasons["line_px"]
 
 
 def test_without_hum_and_one_over_f_there_are_limits(rng: np.random.Generator):
