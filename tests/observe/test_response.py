@@ -100,6 +100,22 @@ def test_knee_is_found_with_its_place_and_slope(rng: np.random.Generator):
     assert "knee" in unmeasured["electronics.gamma"]
 
 
+def test_places_of_a_knee_between_two_patches_are_in_u(rng: np.random.Generator):
+    """One patch of 1931 DN is above the knee: it may lie anywhere from the next patch, 1704 DN, up to that: 227 DN/√12 = 65 DN and more.
+
+    The densities are right, and noise is a tenth of what they may be off by; so u hardly scatters.
+    """
+    light, _ = wedge(DENSITIES, WHITE_E)
+    curve, facts = knee(1773, 0.25), GroupFacts(densities=tuple(DENSITIES), u_light_rel=0.02)
+    frames = Frames("chart", None, expose(rng, light, curve, gain=0.3), facts=facts)
+    dark = Frames("dark", 0.01, expose(rng, np.zeros(light.shape), curve, gain=0.3))
+    response = observed(frames, dark).response
+    assert response is not None and response.curve == "knee"
+    within(response.fit, "switch_dn", 1773)
+    within(response.fit, "mismatch_rel", -0.75)
+    assert response.fit["switch_dn"].u > 50
+
+
 def test_logarithm_is_found_with_slope_and_foot(rng: np.random.Generator):
     """300 DN per factor e is 300/(kT/q) DN/V at 20 °C: kT/q = 25.26 mV (CODATA 2018)."""
     seen = observed(*scene(rng, lambda x: 300 * np.log1p(np.maximum(x, 0) / 100), dark_noise_e=0, noise_dn=1.0))

@@ -33,6 +33,8 @@ CUBIC_REL = 0.1  # of its coefficients where it is the curve itself
 CLEARLY = 10.0  # BIC by which a curve must be better
 MISFIT = 25.0  # χ² per degree of freedom: no curve describes the values
 ITERATIONS, RESTING = 60, 1e-7
+HELD_U = 1e-6  # of a parameter that is held
+KNEE_AT, KNEES_LN, KNEE_PLACES = 2, (-3.0, -0.05), 40  # which parameter; logarithms of the light where a knee is put
 KT_PER_Q_V, ZERO_C_K, ROOM_C = 8.617333262e-5, 273.15, 20.0
 POINTS = 101
 DARK_SHARE = 0.1  # of the noise in the dark, by which dark current may lift its mean behind a curve that is steep at black
@@ -169,6 +171,7 @@ class _Fit:
     chi2: float
     dof: int
     bic: float
+    log_det: float  # of the inverse covariance of all unknowns
 
 
 def _model(curve: str, d: _Data, theta: Array, glare: float, shift: Array) -> tuple[Array, Array]:
@@ -192,8 +195,8 @@ def _relative_light(curve: str, theta: Array, white: Array, top_dn: float) -> Ar
     return out
 
 
-def _fit_from(curve: str, d: _Data, theta: Array) -> _Fit | None:
-    """Descent of Levenberg and Marquardt from one start."""
+def _fit_from(curve: str, d: _Data, theta: Array, held: int | None = None) -> _Fit | None:
+    """Descent of Levenberg and Marquardt from one start; a parameter of the curve that is held stays as it is."""
     k, m = len(theta), d.columns.shape[1]
     extra = 1 if d.glare else 0
     p = np.concatenate([theta, np.zeros(extra), np.zeros(m)])
@@ -206,6 +209,8 @@ def _fit_from(curve: str, d: _Data, theta: Array) -> _Fit | None:
     for i, name in enumerate(names):
         if name in ("a1", "a2", "a3"):
             weight[2 + i] = (CUBIC_REL if curve == CUBIC else BEND_REL) ** -2
+    if held is not None:
+        weight[held], prior_mean[held] = HELD_U**-2, theta[held]
     if extra:
         weight[k], prior_mean[k] = GLARE_REL**-2, GLARE_REL
     known = np.isfinite(d.prior)
@@ -258,7 +263,42 @@ def _fit_from(curve: str, d: _Data, theta: Array) -> _Fit | None:
         return None
     covariance = ((vectors / values) @ vectors.T) / np.outer(scale, scale)
     dof = len(d.y) - k - int((~known).sum()) + sum(1 for n in names if n in ("a1", "a2", "a3"))
-    return _Fit(curve, p[:k], covariance[:k, :k], cost, max(dof, 1), cost + k * np.log(len(d.y)))
+    log_det = float(np.log(values).sum() + 2 * np.log(scale).sum())
+    return _Fit(curve, p[:k], covariance[:k, :k], cost, max(dof, 1), cost + k * np.log(len(d.y)), log_det)
+
+
+def _with_other_knees(best: _Fit, d: _Data) -> _Fit:
+    """The fit, with the covariance about it of all knees that fit, by their probability.
+
+    Between two patches, where no light was, the place of a knee is a matter of the slopes on both sides, and more than one place may fit.
+    So the knee is put at many places, the rest is fitted, and each counts by likelihood × volume that is left to the rest (Laplace).
+    """
+    u = float(np.sqrt(best.covariance[KNEE_AT, KNEE_AT]))
+    places = np.concatenate([np.linspace(*KNEES_LN, KNEE_PLACES), best.theta[KNEE_AT] + u * np.linspace(-3, 3, 13)])
+    places = np.unique(places[(places >= KNEES_LN[0]) & (places <= KNEES_LN[1])])
+    widths, tried = [], []
+    for place, width in zip(places, np.gradient(places), strict=True):
+        start = best.theta.copy()
+        start[1] += np.log(_bent_light(best.theta)) - np.log(_bent_light(np.append(start[:KNEE_AT], [place, start[3]])))
+        start[KNEE_AT] = place
+        fit = _fit_from(KNEE, d, start, KNEE_AT)
+        if fit is not None and _lawful(fit):
+            widths.append(width)
+            tried.append(fit)
+    if not tried:
+        return best
+    ratio = max(best.chi2 / best.dof, 1.0)
+    log_weight = np.array([-0.5 * (f.chi2 / ratio + f.log_det) for f in tried]) + np.log(widths)
+    weights = np.exp(log_weight - log_weight.max())
+    away = [f.theta - best.theta for f in tried]
+    spread = sum(w * (f.covariance + np.outer(a, a) / ratio) for w, f, a in zip(weights, tried, away, strict=True)) / weights.sum()
+    return replace(best, covariance=np.asarray(spread, float))
+
+
+def _bent_light(theta: Array) -> float:
+    """Signal at light 1 over the scale, behind a knee."""
+    at = float(np.exp(theta[KNEE_AT]))
+    return at + float(theta[3]) * (1 - at)
 
 
 def _jacobian(curve: str, d: _Data, p: Array, k: int, extra: int, slope: Array) -> Array:
@@ -310,6 +350,7 @@ def fit_curves(d: _Data) -> list[_Fit]:
     fits.sort(key=lambda f: f.bic)
     if not fits:
         return []
+    fits = [_with_other_knees(f, d) if f.curve == KNEE and f.bic < fits[0].bic + CLEARLY else f for f in fits]
     close = [f for f in fits if f is fits[0] or (f.curve in (LINEAR, CUBIC) and f.bic < fits[0].bic + CLEARLY)]
     best = min(close, key=lambda f: CURVES.index(f.curve))
     return [best, *(f for f in fits if f is not best)]
