@@ -2,7 +2,8 @@
 
 ``python benchmarks/study_recordings.py [--cameras 12] [--seed 1]``
 
-Random analogue cameras (point spread, uneven response, shot noise, amplifier noise, jitter of the grabber, a converter of 8 bits) show 16
+Random analogue cameras (point spread, uneven response, shot noise, amplifier noise, half of them with a video amplifier of 6 to 12 MHz,
+jitter of the grabber, a converter of 8 bits) show 16
 frames of many discs directly and 16 from a tape of random bandwidth, noise, time base and step of the heads; random digital cameras show 12
 frames directly and 24 through H.264 of a random quantiser and group, or through a lossless coder. For each value: mean and standard
 deviation of z = (value − truth)/u, its largest, and the median of u over the truth; of a limit, how often it holds.
@@ -76,6 +77,8 @@ def main() -> None:
             }
             setting: dict[str, Any] = {"generations": 1, **truth}
             more = {"grabber.line_jitter": {"white_ns": 2.0}}
+            if rng.choice([False, True]):
+                more["electronics.video_amplifier"] = {"natural_mhz": float(rng.uniform(6, 12))}
             facts: dict[str, Any] = {"interface": "analogue", "pixel_clock_mhz": CLOCK_MHZ}
         else:
             lossless = bool(rng.choice([False, False, True]))
@@ -98,6 +101,8 @@ def main() -> None:
             group = found[source].settings.get("group")
             if truth and group is not None:
                 right["group"].append(group == truth["group"])
+        if taped:
+            right["bandwidth told"].append("bandwidth_mhz" in found[source])
         for name in (n for n in truth if n in found[source]):
             e = found[source][name]
             if e.is_limit or not truth[name]:

@@ -186,7 +186,7 @@ SET_UPS = {
             "The chart, or any scene with sharp upright edges all over; nothing moves. Once directly, once from the recorder, by the same "
             "frame grabber.",
             "White at 70 % of saturation.",
-            "quantiser to 1; bandwidth of a tape to 3 %, its jitter to 3 %",
+            "quantiser to 1; jitter of a tape to 5 % (3 MHz) to 15 % (4.5 MHz)",
             (_series("recording", 16), _series("recording", 32, recorded=True)),
             "edges",
         ),

@@ -8,6 +8,7 @@ noise, and its lines come early or late.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,9 @@ from pixmetry.sources.storage.video_codec import DEPTHS, Coder, VideoCodec
 LEAST_FRAMES = 8  # of each: for noise, and to see a group of pictures
 MOST_SIDE, MOST_TRIED = 256, 12  # px of the part in the middle of the frames, and number of frames, on which a coder is tried
 SIGNIFICANT = 3.0
-JUMP = 5.0  # robust standard deviations by which the difference to a picture coded by itself stands out
+BY_CHANCE = 1e-6  # probability that some group of pictures stands out as much where there is none
+TILTED = 5.0  # standard deviations by which a change of the coarse over the fine part stands out
+NEARLY = 1.5  # ratio of sums of squares, below which another period describes them as well
 FREEZES = 0.02  # of the noise variance: what a lossy coder takes away at least
 BLOCK = 4  # px, the smallest that is transformed
 LUMPY, TILT = 0.15, 0.03  # by which the kurtosis of the noise rises, and the logarithm of its coarse over its fine part
@@ -35,9 +38,8 @@ CLEARLY = 0.25  # of the misfit three quantisers off, above which the best one i
 U_QUALITY = 1.0  # one coder decides not quite as another
 LEAST_CONTRAST = 30.0  # of the scene's power over that of the noise, at a frequency that is compared
 BANDS = 48  # frequencies along a row
-ALIKE_MISFIT = 1.3  # ratio of sums of squares, below which a staircase and a smooth line are not told apart
+CLEAR_MISFIT = 16.0  # ratio of sums of squares, from which on it is clear that a line is a staircase, or smooth
 ABOVE_SWITCH = 0.8  # share of the rows that lie above where heads switch
-MODEL_U_REL = 0.02  # of a bandwidth: a staircase that is sampled a little beside the middle of its steps, a filter of another shape
 BLOCKS = 8  # parts of the rows whose scatter is the u of the bandwidth
 LEAST_ROWS = 0.25  # share of the rows that show where they are, for their jitter
 EDGE_PX = 4  # of a row to either side, that are left out
@@ -45,6 +47,10 @@ ROW_U_PX = 0.25  # of the place of one row, above which it shows nothing
 DIGITAL_ONLY, ANALOGUE_ONLY = "a tape records an analogue signal: the camera is digital", "a coder behind a tape is not told from the tape"
 METHOD = "one scene at rest, directly and recorded: noise from frame to frame, contrast along the rows, places of the rows"
 CODER = "quantiser with which a coder (libx264, libx265) leaves such noise of the direct frames"
+FILTER_AHEAD = (
+    "the contrast is not clearly that of a staircase of pixels, or of a smooth line: a filter ahead of the recorder shapes the direct "
+    "frames, or noise hides it"
+)
 LOSSLESS = "noise is as before, and does not freeze: the recorder loses nothing that these frames show"
 
 
@@ -94,17 +100,20 @@ def recordings_of(
             sum(n.value**2 for n in e if n.unit == "px" and n.name in ("white_px", "loop_px") and not n.is_limit)
             for e in (played, straight)
         ]
-        band, held = _bandwidth(frequency, parts, max(jitter[0] - jitter[1], 0.0))
-        expected = means[0]
-        if "bandwidth_rel" in band:
-            own = float(band["bandwidth_rel"].value)
+        own_px = next((n.value for n in straight if n.name == "white_px" and not n.is_limit), 0.0)
+        band, ways = _bandwidth(frequency, parts, max(jitter[0] - jitter[1], 0.0), own_px)
+        expected, lowest = means[0], 1.0
+        if ways:
+            best = min(ways, key=lambda way: way.misfit)
+            lowest = max(float(bessel_gain(np.ones(1), float(np.exp(way.logarithm)))[0]) for way in ways)
             expected = _waved(
                 expected,
                 np.zeros(len(expected)),
-                gain=lambda f: bessel_gain(f, own, held=held) * np.exp(-2 * (np.pi * f) ** 2 * jitter[0]),
+                gain=lambda f: bessel_gain(f, float(np.exp(best.logarithm)), held=best.held) * np.exp(-2 * (np.pi * f) ** 2 * jitter[0]),
             )
+        played = _beside_delays(played, lowest)
         step = row_shifts(means[1][None], expected, passes=3)[0]
-        fit = fit.join(band, _added_noise(before, after), _head_switch(step), _untold(("quality", "group"), ANALOGUE_ONLY))
+        fit = fit.join(band, _added_noise(before, after), _head_switch(step, lowest), _untold(("quality", "group"), ANALOGUE_ONLY))
     else:
         fit = fit.join(_coder(before, after, squares[1], noise, correlation, depth_bits))
         fit = fit.join(_untold(("bandwidth_rel", "noise_dn", "head_switch_px"), DIGITAL_ONLY))
@@ -192,47 +201,93 @@ def bessel_gain(frequency: Array, bandwidth: float, *, held: bool = False) -> Ar
     return gain
 
 
-def _bandwidth(frequency: Array, parts: Array, jitter_px2: float) -> tuple[Estimates, bool]:
-    """Bandwidth in cycles per pixel, by the contrast of blocks of rows; and whether it follows the staircase of the camera's pixels.
+@dataclass(frozen=True)
+class _Way:
+    """Bandwidth by one description of the line: mean logarithm of the blocks of rows, its u, their number, and what is left."""
+
+    held: bool
+    logarithm: float
+    u: float
+    count: int
+    misfit: float
+
+
+def _bandwidth(frequency: Array, parts: Array, jitter_px2: float, direct_px: float) -> tuple[Estimates, list[_Way]]:
+    """Bandwidth in cycles per pixel, by the contrast of blocks of rows; and that of a smooth line and of a staircase of pixels.
 
     Of one recording: of copies of copies each has a wider one. Rows that jitter blur the mean image by as much more. Without a filter ahead
     of the recorder the line is a staircase of pixels, whose steps the recorder's filter averages and samples taken directly do not: a sinc.
-    What describes the contrast better is taken.
+    A filter ahead takes some of the steps, and what it leaves of them at the pixel clock is in the direct frames by the phase of their
+    sampling. Neither is known, and the bandwidth is then wrong by up to a half: it is told where one of the two ends describes the contrast
+    clearly better. u holds what is not known of the jitter; and of the difference of the two as much as the sum of squares leaves of the
+    other one.
     """
-    from scipy.optimize import minimize_scalar
-
-    ways = []
+    ways, doubts = [], [0.0, 0.0]
     for held in (False, True):
         known = np.exp(-2 * (np.pi * frequency) ** 2 * jitter_px2)
-        found, misfits = [], 0.0
-        for part in parts:
-            seen = np.isfinite(part)
-            if seen.sum() < 4:
-                continue
-
-            def misfit(logarithm: float, part: Array = part, seen: np.ndarray = seen, known: Array = known, held: bool = held) -> float:
-                model = known[seen] * bessel_gain(frequency[seen], float(np.exp(logarithm)), held=held)
-                scale = float(model @ part[seen] / (model @ model))
-                return float(((part[seen] - scale * model) ** 2).sum())
-
-            best = minimize_scalar(misfit, bounds=(np.log(0.02), np.log(5.0)), method="bounded")
-            found.append(float(best.x))
-            misfits += float(best.fun)
-        ways.append((misfits, np.array(found)))
-    held = ways[1][0] < ways[0][0]
-    logs = ways[held][1]
-    if len(logs) < 3:
-        why = "the scene has too little contrast at high frequencies: show sharp edges or texture"
-        return _untold(("bandwidth_rel",), why), held
-    value, u = float(np.exp(logs.mean())), float(np.hypot(logs.std(ddof=1) / np.sqrt(len(logs)), MODEL_U_REL))
-    if max(way[0] for way in ways) < ALIKE_MISFIT * min(way[0] for way in ways):
-        u = float(np.hypot(u, (ways[1][1].mean() - ways[0][1].mean()) / np.sqrt(12)))
+        # direct samples lie where a straight line from pixel to pixel has its bend: jitter loses in proportion to its mean size
+        loss = 1 - float(np.sqrt(2 / np.pi)) * direct_px * (1 - np.cos(2 * np.pi * frequency))
+        way = _way(frequency, parts, known / loss if held else known, held)
+        if way is None:
+            return _untold(("bandwidth_rel",), "the scene has too little contrast at high frequencies: show sharp edges or texture"), []
+        ways.append(way)
+        if held and direct_px:
+            other = _way(frequency, parts, known, held)
+            doubts[held] += 0.0 if other is None else (way.logarithm - other.logarithm) ** 2 / 12
+        if jitter_px2:  # which is known as well as the delays that move the rows
+            at_clock = min(float(bessel_gain(np.ones(1), float(np.exp(way.logarithm)))[0]), 0.5)
+            other = _way(frequency, parts, (known / loss if held else known) * known ** (2 * np.sqrt(2) * at_clock), held)
+            doubts[held] += 0.0 if other is None else (way.logarithm - other.logarithm) ** 2
+    best, other = sorted(ways, key=lambda way: way.misfit)
+    ratio = other.misfit / max(best.misfit, 1e-12)
+    if ratio < CLEAR_MISFIT:
+        return _untold(("bandwidth_rel",), FILTER_AHEAD), ways
+    shape = (other.logarithm - best.logarithm) / float(np.sqrt(3 * ratio))
+    value, u = float(np.exp(best.logarithm)), float(np.sqrt(best.u**2 + shape**2 + doubts[best.held]))
+    dof = best.count - 1.0
     if value * (1 - SIGNIFICANT * u) > 0.5 * 3:
         what = "the contrast hardly falls up to the highest frequency of the pixels; 95 % lower limit"
-        row = ("bandwidth_rel", value * float(np.exp(-ONE_SIDED_95 * u)), value * u, len(logs) - 1.0, "cycles/px")
+        row = ("bandwidth_rel", value * float(np.exp(-ONE_SIDED_95 * u)), value * u, dof, "cycles/px")
         found_limit = Estimates.from_rows([row], method=METHOD, lower_limits=frozenset(["bandwidth_rel"]), reasons={"bandwidth_rel": what})
-        return found_limit, held
-    return Estimates.from_rows([("bandwidth_rel", value, value * u, len(logs) - 1.0, "cycles/px")], method=METHOD), held
+        return found_limit, ways
+    return Estimates.from_rows([("bandwidth_rel", value, value * u, dof, "cycles/px")], method=METHOD), ways
+
+
+def _way(frequency: Array, parts: Array, known: Array, held: bool) -> _Way | None:
+    """The bandwidth of every block of rows, where known factors lower the contrast too; None where fewer than three show it."""
+    from scipy.optimize import minimize_scalar
+
+    found, left = [], []
+    for part in parts:
+        seen = np.isfinite(part)
+        if seen.sum() < 4:
+            continue
+
+        def off(logarithm: float, part: Array = part, seen: np.ndarray = seen) -> Array:
+            model = known * bessel_gain(frequency, float(np.exp(logarithm)), held=held)
+            scale = float(model[seen] @ part[seen] / (model[seen] @ model[seen]))
+            return np.asarray(part - scale * model)
+
+        best = minimize_scalar(
+            lambda logarithm, off=off: float(np.nansum(off(logarithm) ** 2)), bounds=(np.log(0.02), np.log(5.0)), method="bounded"
+        )
+        found.append(float(best.x))
+        left.append(off(best.x))
+    if len(found) < 3:
+        return None
+    seen = np.isfinite(left).any(axis=0)
+    misfit = float((np.nanmean(np.array(left)[:, seen], axis=0) ** 2).sum())  # what blocks have in common, not their noise
+    return _Way(held, float(np.mean(found)), float(np.std(found, ddof=1) / np.sqrt(len(found))), len(found), misfit)
+
+
+def _beside_delays(played: Estimates, at_clock: float) -> Estimates:
+    """Jitter of the rows with what a delay moves a row by in doubt.
+
+    What passes the recorder at the pixel clock, ``at_clock`` = |H| there, folds back: a row moves by 1 − 2 |H| cos φ times its delay,
+    with the phase φ of the sampling; its standard deviation over all phases is √2 |H|.
+    """
+    moved = np.array([n.value if n.unit == "px" and not n.is_limit else 0.0 for n in played])
+    return replace(played, covariance=played.covariance + 2 * at_clock**2 * np.outer(moved, moved)) if len(moved) else played
 
 
 def _added_noise(before: np.ndarray, after: np.ndarray) -> Estimates:
@@ -320,8 +375,12 @@ def row_jitter_of(frames: np.ndarray) -> Estimates:
     return fit_jitter([RowSeries(row, 0.5 * (one + other), noise, u_rel, np.zeros(row.size), np.zeros((2, row.size)))])
 
 
-def _head_switch(step_px: Array) -> Estimates:
-    """Step of the rows at the end of both fields, against the rows above; and from which row on it begins."""
+def _head_switch(step_px: Array, at_clock: float) -> Estimates:
+    """Step of the rows at the end of both fields, against the rows above; and from which row on it begins.
+
+    Rows of a field that move alike count as fewer. What passes the recorder at the pixel clock, ``at_clock``, folds back: places are off by
+    |H|/π sin 2πφ with the phase φ of the sampling, and a step δ by √2 |H|/π |sin πδ| over all phases.
+    """
     seen = np.flatnonzero(np.isfinite(step_px))
     rows = len(step_px)
     if seen.size < LEAST_ROWS * rows or (seen > rows - 24).sum() < 8:
@@ -329,13 +388,17 @@ def _head_switch(step_px: Array) -> Estimates:
     values = step_px[seen]
     above = values[seen < ABOVE_SWITCH * rows]
     scatter = 1.4826 * float(np.median(np.abs(above - np.median(above))))
+    near = np.isfinite(step_px[:-2]) & np.isfinite(step_px[2:]) & (np.arange(2, rows) < ABOVE_SWITCH * rows)
+    off = np.clip(step_px - np.median(above), -3 * scatter, 3 * scatter)
+    alike = float((off[:-2] * off[2:])[near].mean() / max(float(np.square(off[:-2][near]).mean()), 1e-12)) if near.any() else 0.0
+    fewer = max(1.0, (1 + alike) / max(1 - alike, 0.05))
     best, gain = None, 0.0
     for count in range(2, 61):
         tail = values[seen >= rows - 2 * count]
         if tail.size < 4:
             continue
         size = float(np.median(tail) - np.median(above))
-        won = tail.size * (np.mean(tail) - np.median(above)) ** 2 / max(scatter, 1e-6) ** 2
+        won = tail.size / fewer * (np.mean(tail) - np.median(above)) ** 2 / max(scatter, 1e-6) ** 2
         if won > gain:
             best, gain = (count, float(np.mean(tail) - np.median(above)), tail.size, size), won
     if best is None or gain < 25.0 + 2 * np.log(60):
@@ -344,7 +407,9 @@ def _head_switch(step_px: Array) -> Estimates:
         row = ("head_switch_px", limit, scatter, float(above.size), "px")
         return Estimates.from_rows([row], method=METHOD, limits=frozenset(["head_switch_px"]), reasons=why)
     count, size, number, _ = best
-    row = ("head_switch_px", size, scatter * float(np.sqrt(1 / number + 1 / above.size)), float(number - 1), "px")
+    folded = float(np.sqrt(2)) * at_clock / np.pi * abs(float(np.sin(np.pi * size)))
+    u = float(np.hypot(scatter * np.sqrt(fewer * (1 / number + 1 / above.size)), folded))
+    row = ("head_switch_px", size, u, float(number - 1), "px")
     return Estimates.from_rows([row], method=METHOD, settings={"head_switch_rows": count})
 
 
@@ -354,14 +419,29 @@ def group_of(squares: Array) -> int | None:
     The picture coded by itself does not repeat what the others froze: the difference to it is larger, once a group.
     """
     above = squares[1:-1] - 0.5 * (squares[:-2] + squares[2:])  # without what freezes more and more within a group
-    for values in (above, squares):
-        median = float(np.median(values))
-        scatter = max(1.4826 * float(np.median(np.abs(values - median))), 0.01 * float(np.median(squares)), 1e-9)
-        high = np.flatnonzero(values > median + JUMP * scatter)
-        period = int(np.gcd.reduce(np.diff(high))) if high.size > 1 else 0
-        if period > 1:
-            return period
-    return None
+    told = {_period(values) for values in (above, squares)} - {None}
+    return told.pop() if len(told) == 1 else None
+
+
+def _period(values: Array) -> int | None:
+    """The period of which one value each time stands out; None where none does, or another one describes them nearly as well."""
+    from scipy.stats import t as student
+
+    left = []
+    for period in range(2, len(values) // 2 + 1):
+        for phase in range(period):
+            high = np.arange(len(values)) % period == phase
+            step = float(values[high].mean() - values[~high].mean())
+            if high.sum() > 1 and step > 0:
+                squares = float(sum(np.square(part - part.mean()).sum() for part in (values[high], values[~high])))
+                u = float(np.sqrt(squares / max(len(values) - 2, 1) * (1 / high.sum() + 1 / (~high).sum())))
+                left.append((squares, period, step / max(u, 1e-9)))
+    left.sort()
+    if not left or (len(left) > 1 and left[1][0] < NEARLY * left[0][0]):
+        return None
+    if len(left) * float(student.sf(left[0][2], len(values) - 2)) > BY_CHANCE:
+        return None
+    return left[0][1]
 
 
 def traces_of(frames: np.ndarray) -> Array:
@@ -396,7 +476,7 @@ def _coder(before: np.ndarray, after: np.ndarray, squares: Array, noise: Estimat
     was, told_of = traces_of(before), traces_of(after)
     values = 3 * (len(after) - 1) / 2 * after[0].size / BLOCK**2  # of the coarse coefficients
     coarse, fine = np.maximum(np.array([told_of[1:3], was[1:3]]), 1e-6).T
-    tilted = abs(float(np.log(coarse[0] / coarse[1] * fine[1] / fine[0]))) > max(TILT, JUMP * float(np.sqrt(8 / values)))
+    tilted = abs(float(np.log(coarse[0] / coarse[1] * fine[1] / fine[0]))) > max(TILT, TILTED * float(np.sqrt(8 / values)))
     lumpy = told_of[3] - was[3] > LUMPY or tilted
     frozen = alike.value > max(SIGNIFICANT * alike.u, FREEZES)
     less = ratio.value < 1 - max(FREEZES, SIGNIFICANT * ratio.u)

@@ -26,7 +26,7 @@ CONFOUNDERS = (
     "the number of copies: their errors grow with its root, and only what all of them add is told",
     "filters of the frame grabber behind the tape, which take part of its noise",
 )
-UNFILTERED_U_REL = 0.25  # of the shift of rows that were not filtered
+UNFILTERED_U_REL = 0.25  # of the shift of rows in the direct frames: that behind an amplifier of 8 MHz
 PERIODS = 6  # of the bandwidth, to either side, over which the noise is alike
 BESSEL_3 = np.array([-1.32267580, -1.04740916 + 0.99926444j, -1.04740916 - 0.99926444j])  # poles for −3 dB at 1 rad/s
 
@@ -199,7 +199,7 @@ def _by_recordings(observations: Observations, seen: Recordings) -> Estimates:
     found = found.scaled({name: factor for name, factor in factors.items() if name in found})
     jitter = Estimates.empty()
     if "white_px" in seen.played and "white_px" in seen.direct:
-        # without a filter ahead rows are moved by a quarter more or less than their delay (row_delays.GAIN_REL)
+        # direct rows are moved by a quarter more or less than their delay (row_delays.GAIN_REL)
         doubt = np.diag([(UNFILTERED_U_REL * n.value) ** 2 if n.unit == "px" else 0.0 for n in seen.direct])
         added = added_delays(seen.played, replace(seen.direct, covariance=seen.direct.covariance + doubt), where=where)
         jitter = delays_ns(added, {"white": "white_ns", "loop": "wow_ns", "loop_rows": "wow_rows"}, clock, where=where)
