@@ -151,7 +151,8 @@ def test_single_fields_in_turn_are_told_by_targets_at_rest(rng: np.random.Genera
     assert get_source("sensor.read_out").measure(seen).settings == {"mode": "field", "field": "alternating"}
 
 
-def test_two_pulses_of_light_and_the_steady_light_beside_them(rng: np.random.Generator) -> None:
+@pytest.mark.parametrize("swapped", [False, True])
+def test_two_pulses_of_light_and_the_steady_light_beside_them(swapped: bool, rng: np.random.Generator) -> None:
     exposure_s, apart_s, share = 0.02, 2e-3, 0.2
     steady = runs_of(rng, exposure_s, (AT_REST, RIGHT, DOWN), 4, field_s=0.02)
     pulsed = []
@@ -163,6 +164,8 @@ def test_two_pulses_of_light_and_the_steady_light_beside_them(rng: np.random.Gen
             times, weights = np.column_stack([times, flash]), np.column_stack([share * weights, np.full(SHAPE[0], 1 - share)])
             frames.append(frame_of(PLATE + shift, np.array(velocity), times, weights, rng))
         pulsed.append(Frames("motion", exposure_s, np.array(frames), facts=GroupFacts(interval_s=PERIOD_S, pulsed=True)))
+    rows = np.arange(SHAPE[0]) ^ swapped
+    steady, pulsed = ([Frames("motion", g.exposure_s, g.data[:, rows], facts=g.facts) for g in groups] for groups in (steady, pulsed))
     fit = measured([*steady, *pulsed]).motion.fit
     for name, truth in (("separation_s", apart_s), ("ambient_share", share)):
         assert abs(fit[name].value - truth) < 7 * fit[name].u < truth, name  # Student's t of 8 degrees

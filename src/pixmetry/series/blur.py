@@ -155,7 +155,9 @@ def exposure_of(targets: Sequence[Sequence[Look]], row_time_s: float = 0.0, u_sp
     return Estimates.from_rows([row], method=METHOD, confounders=CONFOUNDERS, limits=limits, reasons={"exposure_s": why})
 
 
-def pulses_of(targets: Sequence[Sequence[tuple[Look, Look]]], exposure_s: float, field_s: float, stated_s: float = 0.0) -> Estimates:
+def pulses_of(
+    targets: Sequence[Sequence[tuple[Look, Look]]], exposure_s: float, field_s: float, stated_s: float = 0.0, below_px: float = 0.0
+) -> Estimates:
     """Time between two pulses of light, and the share of steady light, from pictures in the first and in the second field.
 
     Parameters
@@ -166,6 +168,8 @@ def pulses_of(targets: Sequence[Sequence[tuple[Look, Look]]], exposure_s: float,
         Length of the exposure of a field, and time between the fields, as found without pulses.
     stated_s : float
         The exposure that is set, at whose end the first pulse is; 0 where it was not stated.
+    below_px : float
+        By how much pictures in the second field lie below those in the first, of which the places are free: where rows are swapped.
 
     Returns
     -------
@@ -193,7 +197,7 @@ def pulses_of(targets: Sequence[Sequence[tuple[Look, Look]]], exposure_s: float,
             if fit is None:
                 break
             shifts = (fit.places - np.array([look.place for look in looks])).reshape(-1, 2, 2)
-            late = _separation(moving, shifts[:, 1] - shifts[:, 0])
+            late = _separation(moving, shifts[:, 1] - shifts[:, 0] - [0.0, below_px])
         if np.isfinite(share):
             found.append((late, share))
         if len(found) == MOST_TARGETS:

@@ -109,7 +109,7 @@ def motion_of(runs: Sequence[Run], frame_shape: tuple[int, int]) -> MotionSeries
     fields, lag, u_lag = _fields(parts, steady)
     rows, shear, u_shear = _rows(parts, mean_speed, frame_shape)
     exposure, stated_s = _exposure(steady, rows)
-    fit = fields.join(rows, _jitter(parts), exposure, order, _pulses(parts, fields, exposure))
+    fit = fields.join(rows, _jitter(parts), exposure, order, _pulses(parts, fields, exposure, order))
     return MotionSeries(
         frames=len(counts), targets=int(counts.max()), speed_px_s=mean_speed, lag_px=lag, shear=shear, u_lag_px=u_lag,
         u_shear=u_shear, stated_exposure_s=stated_s, fit=fit,
@@ -271,7 +271,7 @@ def _known_again(parts: Sequence[_Followed]) -> list[dict[int, int]]:
     return [dict(zip(other.tolist(), one.tolist(), strict=True)) for one, other in pairs]
 
 
-def _pulses(parts: Sequence[_Followed], fields: Estimates, exposure: Estimates) -> Estimates:
+def _pulses(parts: Sequence[_Followed], fields: Estimates, exposure: Estimates, order: Estimates) -> Estimates:
     """Time between two pulses of light, and the share of steady light; nothing where no run is in such light."""
     pulsed = [p for p in parts if p.run.pulsed]
     names = ("separation_s", "ambient_share")
@@ -291,7 +291,8 @@ def _pulses(parts: Sequence[_Followed], fields: Estimates, exposure: Estimates) 
         for i, pairs in _looks(part).items():
             if i in own:
                 looks.setdefault(own[i], []).extend((odd, even) if first else (even, odd) for even, odd in pairs)
-    return pulses_of(list(looks.values()), known[1] * scale, known[0], pulsed[0].run.exposure_s)
+    below = SWAPPED_PX * (-1.0 if first else 1.0) if order.settings.get("swapped") else 0.0
+    return pulses_of(list(looks.values()), known[1] * scale, known[0], pulsed[0].run.exposure_s, below)
 
 
 def _fields(parts: Sequence[_Followed], steady: Sequence[_Followed]) -> tuple[Estimates, Array, Array]:
