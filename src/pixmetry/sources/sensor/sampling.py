@@ -43,7 +43,7 @@ SOURCE = Source(
     advice="Stop the lens down or defocus until a point is seen in two pixels or more; take larger targets.",
     reasons={
         "forward": "it is what pixels are: there is no camera without it",
-        "measure": "needs many targets at all phases: the amplitude of sin 2πx in their residuals",
+        "measure": "it has no parameter of its own: the swing follows from the spread of lens and pixels, which slanted edges measure",
         "correct": "the swing of a known target can be looked up by its phase; fitting the right template has none",
         "neutral": "it has no parameters: nothing of it can be switched off",
     },
