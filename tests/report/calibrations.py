@@ -267,7 +267,16 @@ def tests_of(rng: np.random.Generator, adj: Adjustment) -> dict[str, Any]:
     advice = "use larger or softer targets"
     out["patterns"] = [
         {"name": "radius", "camera": camera, "amplitude_px": 0.001, "u_px": None, "p": 0.41, "significant": False, "advice": advice},
-        {"name": "phase_x", "camera": camera, "amplitude_px": 0.0123, "u_px": 0.0011, "p": 3e-6, "significant": True, "advice": advice},
+        {
+            "name": "phase_x",
+            "camera": camera,
+            "amplitude_px": 0.0123,
+            "u_px": 0.0011,
+            "p": 3e-6,
+            "significant": True,
+            "causes": ["pixels that see little of the light"],
+            "advice": advice,
+        },
     ]
     names = ["k1", "k2", "k3"]
     out["parameter_groups"] = [{"camera": camera, "group": "radial", "names": names, "f": 512.0, "dof": (3, adj.dof), "p": 0.0}]

@@ -113,7 +113,7 @@ def test_every_record_is_on_the_page(whole: Calibration, page: Page) -> None:
     assert "points as given 0.081 0.092 0.062 points free 0.039 0.044 0.029" in text
     assert "With noise alone, half of the residuals of images left out would be above 0.027 px" in text
     assert "xp +1.81 0.110 16.5" in text
-    assert "x residuals depend on the sub-pixel phase 0.012 ± 0.0011 3.0 × 10⁻⁶ Possible cause: pixels" in text
+    assert "x residuals depend on the sub-pixel phase 0.012 ± 0.0011 3.0 × 10⁻⁶ Possible cause: pixels that see little" in text
     assert "1003 image points were corrected for the eccentricity of circular targets, by at most 0.023 px." in text
     assert whole.adjustment.datum in text
     assert "image_coordinates.csv" in text and "pixmetry calibrate project.yaml" in text and "field = auto" in text

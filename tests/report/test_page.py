@@ -146,10 +146,10 @@ def test_structure_is_accessible() -> None:
     depth = [int(level[1]) for level, _ in found.headings]
     assert depth[0] == 1
     assert all(b <= a + 1 for a, b in zip(depth, depth[1:], strict=False))
-    assert [t.strip()[0] for level, t in found.headings if level == "h2"] == list("12345678")
+    assert [t.strip()[0] for level, t in found.headings if level == "h2"] == list("123456789")
     assert all("scope" in attrs for attrs in found.of("th"))
     figures = [a for a in found.of("svg") if "figure" in a.get("class", "")]
-    assert len(figures) == 10
+    assert len(figures) == 11
     assert all(a["role"] == "img" and len(a["aria-label"]) > 30 for a in figures)
     assert all(attrs.get("aria-label") for attrs in found.of("div") if attrs.get("role") == "region")
 

@@ -122,6 +122,5 @@ def spectrum_figure(found: DarkRows) -> Figure:
         axes.set_xlabel("cycles a row")
         axes.set_ylabel("power / DN²")
         caption = "Spectrum of the means of dark rows, without a hum that was found. Dashed: fit of white noise, row noise and 1/f noise."
-        return Figure(
-            figure, "dark-rows", f"Spectrum of the means of dark rows. {hum_sentence(found)} {flicker_noise_sentence(found)}", caption
-        )
+        alt = f"Spectrum of the means of dark rows. {hum_sentence(found)} {flicker_noise_sentence(found)}"
+        return Figure(figure, "dark-rows-spectrum", alt, caption)

@@ -89,7 +89,8 @@ def _fit_settling(profile: np.ndarray) -> Estimates:
     dof = len(profile) - 3.0
     if best is not None:  # rows that are noisy alike, as by flicker, tell less than rows that are independent
         left = profile - best[1][0] * np.exp(-rows / best[1][1]) - best[1][2]
-        lags = [float(left[k:] @ left[:-k]) / float(left @ left) for k in range(1, min(LAGS, len(left) // 4) + 1)]
+        whole = float(left @ left) or 1.0  # frames without noise
+        lags = [float(left[k:] @ left[:-k]) / whole for k in range(1, min(LAGS, len(left) // 4) + 1)]
         best = (best[0], best[1], best[2] * max(1 + 2 * sum(lags), 1.0))
     method = "least squares of B exp(−r/r_s) + c over the row means of the mean dark image"
     if best is not None and np.isfinite(best[2]).all() and abs(best[1][0]) > FOUND_Z * np.sqrt(best[2][0, 0]):
