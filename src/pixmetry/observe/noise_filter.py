@@ -43,7 +43,7 @@ MOST_CLIPPED = 0.002  # share of the pixels at the ends of the codes
 LITTLE_MORE, FALLEN = 1.15, 0.75  # of light and variance from level to level: so much less where pixels are full
 FOUND_Z, FOUND_PATTERN_Z = 4.2, 3.5  # of one of the twelve near lags; of the pattern of repelled charge: false in 1e-3 of cameras
 PRESENT = 0.02  # chance, before anything is measured, that a camera has a filter or temporal noise reduction
-REPELLED = 0.25  # the same of repelled charge that can be seen: every sensor has some
+REPELLED = 0.08  # the same of repelled charge that can be seen: most sensors have some, few so much
 LARGEST_SHARE, LARGEST_LOSS, LARGEST_ALPHA = 0.2, 0.03, 0.9  # if there: all sizes up to this are equally likely
 FIT_LEVEL = 1e-4  # chance of a worse fit below which a family is refused
 NEAR = tuple(k for k, (j, i) in enumerate(LAGS) if 0 < max(abs(j), abs(i)) <= 2)
