@@ -104,12 +104,14 @@ class Camera:
             mean = mean + shift
         else:
             var = var + 1 / 12
-        clipped, clipped_var, _ = _clipped(mean, var, self.top)
-        return clipped, clipped_var, stats.norm.sf((self.top - 0.5 - mean) / np.sqrt(var))
+        skew = 0.0 if full else gain**3 * electrons / var**1.5  # of Poisson's electrons; all other noise is normal
+        clipped, clipped_var, _ = _clipped(mean, var, self.top, skew)
+        c = (self.top - 0.5 - mean) / np.sqrt(var)
+        return clipped, clipped_var, stats.norm.sf(c) + skew / 6 * (c**2 - 1) * stats.norm.pdf(c)
 
 
-def _clipped(mean: np.ndarray, var: np.ndarray, limit: float) -> tuple[np.ndarray, np.ndarray, bool]:
-    """Mean and variance of min(x, limit) for a normal x; and whether any of it is cut off."""
+def _clipped(mean: np.ndarray, var: np.ndarray, limit: float, skew: np.ndarray | float = 0.0) -> tuple[np.ndarray, np.ndarray, bool]:
+    """Mean and variance of min(x, limit) for a nearly normal x (Gram and Charlier's density to the skewness); whether any is cut off."""
     std = np.sqrt(np.maximum(var, 1e-12))
     c = (limit - mean) / std
     if c.min() > 7:
@@ -117,6 +119,8 @@ def _clipped(mean: np.ndarray, var: np.ndarray, limit: float) -> tuple[np.ndarra
     below, density = stats.norm.cdf(c), stats.norm.pdf(c)
     first = np.where(np.isfinite(c), c, 0.0) * (1 - below) - density  # E[min(z, c)] less 0
     second = below - c * density + c**2 * (1 - below)
+    if np.any(skew):  # ∫ (c − z) He₃ φ and ∫ (c² − z²) He₃ φ from c on are −c φ(c) and −2 (c² + 1) φ(c)
+        first, second = first - skew / 6 * c * density, second - skew / 3 * (c**2 + 1) * density
     return mean + std * first, np.maximum(var * (second - first**2), 0.0), True
 
 

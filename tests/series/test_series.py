@@ -202,4 +202,5 @@ def test_frames_of_a_film_may_be_jpeg(rng: np.random.Generator, tmp_path: Path) 
     )
     found = assess(tmp_path / "campaign.yaml", trials=0)
     assert any("kind series are JPEG" in note for note in found.observations.notes)
+    assert "storage.jpeg" not in found.estimates  # how a film was stored is not how the camera stores
     assert "sensor.mount_drift" in found.estimates or "series" in found.unmeasured["sensor.mount_drift"]

@@ -80,7 +80,7 @@ def test_u_is_that_of_the_positions_where_nothing_else_moves(rng) -> None:
     motion, time_s, temperature_c = a_series(rng, a_camera(rng))
     found, _ = thermal_of(motion, time_s, temperature_c)
     t = time_s / time_s[-1]
-    rest = np.column_stack([np.ones_like(t), t, *(np.exp(-t / tau) for tau in (0.05, 0.1, 0.17, 0.3))])
+    rest = np.column_stack([np.ones_like(t), t, *(np.exp(-t / tau) for tau in (0.02, 0.05, 0.1, 0.17, 0.3))])
     own = temperature_c - rest @ np.linalg.lstsq(rest, temperature_c, rcond=None)[0]
     radius2 = (motion.places_px**2).sum()
     bound = U_PX / np.sqrt(radius2) / np.sqrt((own**2).sum())

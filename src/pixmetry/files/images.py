@@ -330,10 +330,10 @@ class FrameReader:
         check_frame(frame.array, str(path), bits=c.bits, shape=c.stored_shape, dtype=c.frame_dtype)
         self.hashes.add(path, frame.sha256, frame.size_bytes)
         if path in self._patterns:  # they show a coder; how the others were stored is another question
-            if frame.table is not None:
+            if frame.table is not None and self._patterns[path] == "pattern":
                 self._tables.add(frame.table)
-                if self._patterns[path] in LOCATED:
-                    self.located_with_loss.add(self._patterns[path])
+            elif frame.lossless is False and self._patterns[path] in LOCATED:
+                self.located_with_loss.add(self._patterns[path])
             return frame.array
         self._coders.add(frame.lossless)
         if frame.lossless is False and c.camera.lossless:

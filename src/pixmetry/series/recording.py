@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.fft import dctn
 
 from pixmetry.camera.recordings import Recordings
 from pixmetry.core.arrays import Array
@@ -453,20 +454,12 @@ def traces_of(frames: np.ndarray) -> Array:
     differences = np.diff(frames, axis=0)
     rows, cols = (n // BLOCK * BLOCK for n in frames.shape[1:])
     tiles = differences[:, :rows, :cols].reshape(len(differences), rows // BLOCK, BLOCK, cols // BLOCK, BLOCK)
-    transform = cosines(BLOCK)
-    found = np.einsum("ui,krilj,vj->kruvl", transform, tiles, transform, optimize=True)
-    second, fourth = (np.mean(found**power, axis=(1, 4)) for power in (2, 4))
+    found = dctn(tiles, axes=(2, 4), norm="ortho")
+    second, fourth = (np.mean(found**power, axis=(1, 3)) for power in (2, 4))
     kurtosis = np.median(fourth / np.maximum(second, 1e-12) ** 2, axis=(1, 2))
     coarse, fine = second[:, [0, 0, 1], [0, 1, 0]].mean(axis=1), second[:, 2:, 2:].mean(axis=(1, 2))
     traces = np.array([np.square(differences).mean(axis=(1, 2), dtype=float), coarse, fine, kurtosis])
     return np.asarray(np.median(traces, axis=1), float)
-
-
-def cosines(size: int) -> Array:
-    """The cosine transform, orthonormal, shape (size, size)."""
-    k, i = np.indices((size, size))
-    waves = np.cos(np.pi * (2 * i + 1) * k / (2 * size)) * np.where(k == 0, np.sqrt(1 / size), np.sqrt(2 / size))
-    return np.asarray(waves, float)
 
 
 def _coder(before: np.ndarray, after: np.ndarray, squares: Array, noise: Estimates, correlation: Estimates, depth_bits: int) -> Estimates:

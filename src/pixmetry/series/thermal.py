@@ -11,7 +11,7 @@ from pixmetry.core.number import Estimates
 from pixmetry.series.modes import FieldMotion
 
 MODES = {"scale_rel": ("scale_per_k", "1/K"), "shift_x_px": ("shift_x_px_per_k", "px/K"), "shift_y_px": ("shift_y_px_per_k", "px/K")}
-SETTLING = (0.05, 0.1, 0.17, 0.3)  # time constants over the length of the series, by which the image may settle besides
+SETTLING = (0.02, 0.05, 0.1, 0.17, 0.3)  # time constants over the length of the series, by which the image may settle besides
 LEAST_FRAMES = 20
 LEAST_K, LEAST_SHARE = 0.3, 0.08  # rms of what the time does not explain of the temperature, and over its standard deviation
 METHOD = "regression of the image's motion on the temperature of the sensor, beside a drift with time"
@@ -35,7 +35,7 @@ def thermal_of(motion: FieldMotion, time_s: Array, temperature_c: Array) -> tupl
 
     Notes
     -----
-    All modes have one design (constant, temperature, time, four exponentials), so that least squares of each is that of all together, with
+    All modes have one design (constant, temperature, time, five exponentials), so that least squares of each is that of all together, with
     the covariance of the residuals between them (A. Zellner, J. Am. Stat. Assoc. 57 (1962) 348–368). Where residuals are correlated from
     frame to frame all u grow by √((1 + ρ)/(1 − ρ)). What drifts with time in another shape than these is no part of the temperature's.
     """
@@ -76,7 +76,7 @@ def thermal_of(motion: FieldMotion, time_s: Array, temperature_c: Array) -> tupl
 
 
 def _drifts(time_s: Array) -> Array:
-    """Constant, time, and four exponentials, shape (frames, 6), each of unit length."""
+    """Constant, time, and five exponentials, shape (frames, 7), each of unit length."""
     t = (time_s - time_s.min()) / max(float(np.ptp(time_s)), 1e-9)
     columns = np.column_stack([np.ones_like(t), t - t.mean(), *(np.exp(-t / tau) for tau in SETTLING)])
     return np.asarray(columns / np.linalg.norm(columns, axis=0))
