@@ -601,7 +601,8 @@ def verdict_of(table: Table, brute: BruteForce, element: Element, sigmas: float)
         room = max(row.model_error * u, row.floor_px, ROUNDING_PX)
         if not low - room <= u <= high + room:
             wrong.append(f"u_{name}")
-        room = max(row.model_error * max(abs(b), u), row.floor_px, ROUNDING_PX) + sigmas * axis.se_bias
+        se_bias = max(axis.se_bias, u / np.sqrt(seen.targets))  # an event of few targets may not be among those seen
+        room = max(row.model_error * max(abs(b), u), row.floor_px, ROUNDING_PX) + sigmas * se_bias
         if not abs(axis.bias - b) <= room:
             wrong.append(f"bias_{name}")
     return Verdict(row, said_u, bias, seen, tuple(wrong))

@@ -8,6 +8,8 @@ from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
+from scipy.optimize import brentq
+from scipy.special import ndtr
 
 from pixmetry.budget.parameters import applies
 from pixmetry.camera.camera import Camera, Element, in_order
@@ -173,7 +175,7 @@ def _own_maps(element: Element, maps: UnitMaps, bend: ConverterBend, seen: Obser
 def _with_true_black(element: Element, seen: Observations) -> Element:
     """The converter with the black level in front of its own uneven thresholds; measured is that of equal steps that store the same.
 
-    Thresholds that lie d_k too high lower the mean that is stored by Σ d_k p(T_k), with the density p of the dark values.
+    Over the stack's pixels, normal noise stores the mean Σ_k Φ((level - T_k) / σ): the level moves until it is that of equal steps.
     """
     moved, dark = element.maps.get("threshold_lsb"), seen.dark_stack
     if moved is None or dark is None:
@@ -181,10 +183,17 @@ def _with_true_black(element: Element, seen: Observations) -> Element:
     std = np.sqrt(max(dark.ms_pixel_dn2 - 1 / 12, 1 / 12))
     places = np.quantile(dark.mean_map_dn, (np.arange(200) + 0.5) / 200)
     codes = np.arange(1, moved.size + 1)
-    near = np.abs(codes - places.mean()) < np.ptp(places) + 8 * std + 2
-    density = np.exp(-0.5 * ((codes[near, None] - 0.5 - places) / std) ** 2).mean(axis=1) / (std * np.sqrt(2 * np.pi))
+    reach = np.ptp(places) + 8 * std + 2
+    near = np.abs(codes - places.mean()) < reach
+    level = (places[:, None] - codes[near] + 0.5) / std
+    equal = ndtr(level).sum()
+
+    def excess(shift_lsb: float) -> float:
+        return float(ndtr(level + (shift_lsb - moved[near]) / std).sum() - equal)
+
+    most = float(np.abs(moved[near]).max(initial=0.0))
     black = element.params.model_dump()
-    black["offset_dn"] += float(moved[near] @ density)
+    black["offset_dn"] += float(brentq(excess, -most, most, xtol=1e-6)) if most > 0 else 0.0
     return replace(element, params=element.source.make(black, where="digital twin, black level"))
 
 
