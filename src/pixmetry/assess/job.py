@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from pixmetry.assess.digital_twin import ASSUMED_RANGE_E, digital_twin, of_unit
+from pixmetry.assess.located_frames import with_located
 from pixmetry.assess.page.page import write_report
 from pixmetry.assess.results import Assessment
 from pixmetry.assess.self_test import self_test
@@ -45,9 +46,6 @@ from pixmetry.locate.target_estimator import TargetEstimator, parse_estimator
 from pixmetry.observe.covered import BorderFrames, covered_pixels
 from pixmetry.observe.observe import Group, observe
 from pixmetry.observe.one_pass import without_levels
-from pixmetry.series.bands import measure_bands
-from pixmetry.series.job import measure_motion, measure_recordings, measure_series
-from pixmetry.series.views import measure_views
 
 KIND = "assessment"
 SPREADING = ("optics.point_spread", "optics.olpf", "sensor.pixel_aperture")
@@ -290,7 +288,6 @@ def observe_campaign(campaign: Campaign, progress: Progress) -> tuple[InputHashe
 
     reader = FrameReader(campaign)
 
-    followed = [g for g in campaign.groups if g.kind in LOCATED]
     shown = [g for g in campaign.groups if g.kind not in LOCATED]
     chosen = [g for g in shown if campaign.camera.cfa is None or g.kind not in ("edge", "chart", "line", "spots", "speckle")]
     note = "edges, lines, spots, laser light and charts are not measured through a colour mosaic: a step of brightness looks jagged there"
@@ -314,16 +311,7 @@ def observe_campaign(campaign: Campaign, progress: Progress) -> tuple[InputHashe
     else:
         alone = without_levels(campaign.frame_shape, campaign.bits)
         seen = Observations(alone, Estimates.empty(), temperature_c=campaign.camera.temperature_c, stated=campaign.stated)
-    if still := [g for g in followed if g.kind == "series"]:
-        seen = _with_series(seen, campaign, still, reader, on_frames)
-    if moving := [g for g in followed if g.kind == "motion"]:
-        seen = _with_motion(seen, campaign, moving, reader, on_frames)
-    if played := [g for g in followed if g.kind == "recording"]:
-        seen = _with_recordings(seen, campaign, played, reader, on_frames)
-    if sides := [g for g in followed if g.kind == "views"]:
-        seen = _with_views(seen, campaign, sides, reader, on_frames)
-    if coloured := [g for g in followed if g.kind == "bands"]:
-        seen = _with_bands(seen, campaign, coloured, reader, on_frames)
+    seen = with_located(seen, campaign, reader.fetch, on_frames)
     fit = seen.photon_transfer_fit
     gain = fit["gain_dn_per_e"].value if fit is not None and "gain_dn_per_e" in fit else None
     known = fit is not None and {"saturation_dn", "offset_dn"} <= set(fit.names)
@@ -333,121 +321,6 @@ def observe_campaign(campaign: Campaign, progress: Progress) -> tuple[InputHashe
     notes = (*campaign.findings, *left_out, *seen.notes, *coded, *(() if bordered is None else bordered.notes))
     facts = campaign.camera
     return reader.hashes, replace(seen, storage=reader.storage, sensor=facts.sensor, covered=bordered, notes=notes)
-
-
-def _with_series(
-    seen: Observations, campaign: Campaign, groups: Sequence[FrameGroup], reader: FrameReader, on_frames: Callable[[int], object]
-) -> Observations:
-    """What the longest series of a fixed field tells."""
-    group = max(groups, key=lambda g: len(g.paths))
-    others = f"of {len(groups)} series the one of the most frames is used" if len(groups) > 1 else ""
-    on_for_s = group.facts.on_for_s or 0.0
-    frames = [(path.name, on_for_s + time, partial(reader.fetch, path)) for path, time in zip(group.paths, _times(group), strict=True)]
-    order = sorted(range(len(frames)), key=lambda k: frames[k][1])
-    told = group.facts.temperatures_c
-    try:
-        found = measure_series(
-            [frames[k] for k in order],
-            analogue=campaign.camera.interface == "analogue",
-            pixel_clock_mhz=campaign.camera.pixel_clock_mhz,
-            temperatures_c=None if told is None else [told[k] for k in order],
-            progress=lambda what, done, of: (on_frames(1), None)[1],
-            bits=campaign.bits,
-        )
-    except MeasureError as problem:
-        note = f"the series of a fixed field tells nothing: {problem}"
-        return replace(seen, failed={**seen.failed, "series": problem.what}, notes=(*seen.notes, note))
-    return replace(seen, drift=found.drift, notes=(*seen.notes, *filter(None, (others, *found.notes))))
-
-
-def _times(group: FrameGroup) -> Sequence[float]:
-    """Seconds of the frames of a group, as stated."""
-    return group.facts.times_s or [k * (group.facts.interval_s or 1.0) for k in range(len(group.paths))]
-
-
-def _with_motion(
-    seen: Observations, campaign: Campaign, groups: Sequence[FrameGroup], reader: FrameReader, on_frames: Callable[[int], object]
-) -> Observations:
-    """What frames of moving targets tell; each group is a run of frames that were taken one after the other."""
-    runs = [[(path.name, time, partial(reader.fetch, path)) for path, time in zip(g.paths, _times(g), strict=True)] for g in groups]
-    try:
-        found = measure_motion(
-            runs,
-            campaign.frame_shape,
-            exposures_s=[g.exposure_s for g in groups],
-            pulsed=[bool(g.facts.pulsed) for g in groups],
-            on_frames=on_frames,
-            bits=campaign.bits,
-        )
-    except MeasureError as problem:
-        note = f"the frames of moving targets tell nothing: {problem}"
-        return replace(seen, failed={**seen.failed, "motion": problem.what}, notes=(*seen.notes, note))
-    return replace(seen, motion=found)
-
-
-def _with_recordings(
-    seen: Observations, campaign: Campaign, groups: Sequence[FrameGroup], reader: FrameReader, on_frames: Callable[[int], object]
-) -> Observations:
-    """What a scene tells of a recorder, directly and recorded; of several groups the longest of each."""
-    sides = [max((g.paths for g in groups if bool(g.facts.recorded) is played), key=len, default=()) for played in (False, True)]
-    fetches = [[partial(reader.fetch, path) for path in paths] for paths in sides]
-    analogue = campaign.camera.interface == "analogue"
-    try:
-        found = measure_recordings(*fetches, analogue=analogue, bits=campaign.bits, on_frames=on_frames)
-    except MeasureError as problem:
-        note = f"the recordings tell nothing: {problem}"
-        return replace(seen, failed={**seen.failed, "recording": problem.what}, notes=(*seen.notes, note))
-    return replace(seen, recordings=found)
-
-
-def _with_views(
-    seen: Observations, campaign: Campaign, groups: Sequence[FrameGroup], reader: FrameReader, on_frames: Callable[[int], object]
-) -> Observations:
-    """What frames of targets that are seen or lit from several sides tell; each frame is a view."""
-    frames = [(path.name, g.exposure_s, partial(reader.fetch, path)) for g in groups for path in g.paths]
-    stated, focal = campaign.stated, campaign.optics.focal_length_mm
-    pitch = stated.pitch_x_um
-    distance = None if pitch is None or focal is None else 1e3 * focal / pitch
-    ratio = 1.0 if pitch is None or stated.pitch_y_um is None else stated.pitch_y_um / pitch
-    try:
-        found = measure_views(frames, distance, ratio, _shading(seen), on_frames=on_frames, bits=campaign.bits)
-    except MeasureError as problem:
-        note = f"the views of targets tell nothing: {problem}"
-        return replace(seen, failed={**seen.failed, "views": problem.what}, notes=(*seen.notes, note))
-    return replace(seen, views=found, notes=(*seen.notes, *(f"Views of targets: {n}" for n in found.notes)))
-
-
-def _with_bands(
-    seen: Observations, campaign: Campaign, groups: Sequence[FrameGroup], reader: FrameReader, on_frames: Callable[[int], object]
-) -> Observations:
-    """What frames of the same targets in light of several wavelengths tell; each group is a band."""
-    bands = [
-        (
-            [(path.name, partial(reader.fetch, path)) for path in g.paths],
-            {
-                "wavelength_nm": g.facts.wavelength_nm,
-                "name": g.facts.band or "",
-                "filtered": bool(g.facts.filtered),
-                "refocused": bool(g.facts.refocused),
-                "exposure_s": g.exposure_s,
-                "on_frames": on_frames,
-            },
-        )
-        for g in groups
-    ]
-    try:
-        found = measure_bands(bands, campaign.frame_shape, campaign.stated, bits=campaign.bits)
-    except MeasureError as problem:
-        note = f"the bands tell nothing: {problem}"
-        return replace(seen, failed={**seen.failed, "bands": problem.what}, notes=(*seen.notes, note))
-    return replace(seen, bands=found, notes=(*seen.notes, *(f"Bands: {n}" for n in found.notes)))
-
-
-def _shading(seen: Observations) -> float:
-    """Largest relative slope of an even field, 1/px; 0 where it was not measured."""
-    fit = seen.spatial_fit
-    names = [n for n in ("gradient_x_per_px", "gradient_y_per_px") if fit is not None and n in fit]
-    return max((abs(fit[n].value) for n in names), default=0.0) if fit is not None else 0.0
 
 
 def by_the_standard(campaign: Campaign, observations: Observations) -> Results:
