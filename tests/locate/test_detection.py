@@ -400,6 +400,10 @@ def test_neighbours_by_brute_force(count: int, reach: float, rng: np.random.Gene
     gap = np.maximum(first[:, None] - stop[None], first[None] - stop[:, None]).max(axis=2)
     near = (gap <= reach) & ~np.eye(count, dtype=bool)
     assert [index[a:b].tolist() for a, b in zip(start[:-1], start[1:], strict=True)] == [np.flatnonzero(row).tolist() for row in near]
+    own, light = rng.uniform(0, 2 * reach + 1, count), rng.choice([0.0, 4.0, 100.0], count)
+    start, index = neighbours(Regions(**({n: zeros for n in names} | boxes)), own, light)
+    near = (gap <= np.maximum(own[:, None], own[:, None] / 2 + light)) & ~np.eye(count, dtype=bool)
+    assert [index[a:b].tolist() for a, b in zip(start[:-1], start[1:], strict=True)] == [np.flatnonzero(row).tolist() for row in near]
 
 
 def test_refuses_what_cannot_be_meant() -> None:

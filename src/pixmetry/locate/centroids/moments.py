@@ -125,7 +125,7 @@ def prepare(
     wanted = margin * blur
     inner = np.maximum(4 * blur, 1.0)
     record[:, k.INNER], record[:, k.OUTER] = inner, inner + 5 + 0.5 * np.sqrt(major * minor)
-    start, index = neighbours(targets, float(np.max(record[:, k.OUTER] + record[:, k.REACH], initial=0.0)))
+    start, index = neighbours(targets, 2 * record[:, k.OUTER], record[:, k.REACH])  # lights that touch the ring, and windows that meet
     turn = record[:, k.ANGLE]
     half_x, half_y = np.hypot(major * np.cos(turn), minor * np.sin(turn)), np.hypot(major * np.sin(turn), minor * np.cos(turn))
     rows, cols = frame.shape

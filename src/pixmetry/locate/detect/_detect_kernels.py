@@ -165,11 +165,12 @@ def group_runs(runs: Runs) -> tuple[Runs, Ints]:
 
 
 @jit
-def boxes_in_reach(box: Ints, reach: float) -> tuple[Ints, Ints]:
-    """For each box (first row, stop row, first column, stop column) the others whose gap is at most ``reach`` in rows and in columns.
+def boxes_in_reach(box: Ints, reach: Array, light: Array) -> tuple[Ints, Ints]:
+    """For each box i (first row, stop row, first column, stop column) the others j whose gap, in rows and in columns, is at most
+    ``reach[i]`` or half of that and ``light[j]``.
 
-    The boxes are put into square cells as large as their mean side and the reach, each into all the cells that it touches when grown
-    by the reach, so the work grows with the number of boxes.
+    The boxes are put into square cells as large as their mean side and the mean reach, each into all the cells that it touches when
+    grown by its light; and looked for in those that a box touches when grown by its reach. The work grows with the number of boxes.
     """
     n = len(box)
     start = np.zeros(n + 1, np.int64)
@@ -177,49 +178,57 @@ def boxes_in_reach(box: Ints, reach: float) -> tuple[Ints, Ints]:
         return start, np.empty(0, np.int64)
     side, rows, cols = 0.0, 0, 0
     for i in range(n):
-        side += 0.5 * (box[i, 1] - box[i, 0] + box[i, 3] - box[i, 2]) / n
+        side += (0.5 * (box[i, 1] - box[i, 0] + box[i, 3] - box[i, 2]) + reach[i]) / n
         rows, cols = max(rows, box[i, 1]), max(cols, box[i, 3])
-    cell = max(side + reach, math.sqrt(rows * cols / (4.0 * n)), 1.0)
+    cell = max(side, math.sqrt(rows * cols / (4.0 * n)), 1.0)
     high, wide = int(rows / cell) + 1, int(cols / cell) + 1
-    cells = np.empty((n, 4), np.int64)
     fill = np.zeros(high * wide + 1, np.int64)
     for i in range(n):
-        cells[i, 0], cells[i, 1] = max(int((box[i, 0] - reach) / cell), 0), min(int((box[i, 1] + reach) / cell), high - 1)
-        cells[i, 2], cells[i, 3] = max(int((box[i, 2] - reach) / cell), 0), min(int((box[i, 3] + reach) / cell), wide - 1)
-        for r in range(cells[i, 0], cells[i, 1] + 1):
-            for c in range(cells[i, 2], cells[i, 3] + 1):
+        top, bottom, left, right = cells_of(box[i], light[i], cell, high, wide)
+        for r in range(top, bottom + 1):
+            for c in range(left, right + 1):
                 fill[r * wide + c + 1] += 1
     for k in range(high * wide):
         fill[k + 1] += fill[k]
     place, member = fill[:-1].copy(), np.empty(fill[-1], np.int64)
     for i in range(n):
-        for r in range(cells[i, 0], cells[i, 1] + 1):
-            for c in range(cells[i, 2], cells[i, 3] + 1):
+        top, bottom, left, right = cells_of(box[i], light[i], cell, high, wide)
+        for r in range(top, bottom + 1):
+            for c in range(left, right + 1):
                 member[place[r * wide + c]] = i
                 place[r * wide + c] += 1
     index, used = np.empty(8 * n, np.int64), 0
     seen = np.full(n, -1, np.int64)
     for i in range(n):
         begin = used
-        for r in range(cells[i, 0], cells[i, 1] + 1):
-            for c in range(cells[i, 2], cells[i, 3] + 1):
+        top, bottom, left, right = cells_of(box[i], reach[i], cell, high, wide)
+        for r in range(top, bottom + 1):
+            for c in range(left, right + 1):
                 for k in range(fill[r * wide + c], fill[r * wide + c + 1]):
                     j = member[k]
                     if seen[j] == i or j == i:
                         continue
                     seen[j] = i
-                    gap_row = max(box[j, 0] - box[i, 1], box[i, 0] - box[j, 1])
-                    gap_col = max(box[j, 2] - box[i, 3], box[i, 2] - box[j, 3])
-                    if gap_row <= reach and gap_col <= reach:
-                        if used == len(index):
-                            more = np.empty(2 * used, np.int64)
-                            more[:used] = index
-                            index = more
-                        index[used] = j
-                        used += 1
+                    far = max(reach[i], 0.5 * reach[i] + light[j])
+                    if max(box[j, 0] - box[i, 1], box[i, 0] - box[j, 1]) > far or max(box[j, 2] - box[i, 3], box[i, 2] - box[j, 3]) > far:
+                        continue
+                    if used == len(index):
+                        more = np.empty(2 * used, np.int64)
+                        more[:used] = index
+                        index = more
+                    index[used] = j
+                    used += 1
         index[begin:used].sort()
         start[i + 1] = used
     return start, index[:used].copy()
+
+
+@jit(inline="always")
+def cells_of(box: Ints, grown: float, cell: float, high: int, wide: int) -> tuple[int, int, int, int]:
+    """First and last row and column of the cells that a box touches when it is grown."""
+    top, bottom = max(int((box[0] - grown) / cell), 0), min(int((box[1] + grown) / cell), high - 1)
+    left, right = max(int((box[2] - grown) / cell), 0), min(int((box[3] + grown) / cell), wide - 1)
+    return top, bottom, left, right
 
 
 @jit

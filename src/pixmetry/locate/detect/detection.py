@@ -167,8 +167,17 @@ def select(targets: Regions, kind: str) -> np.ndarray:
     return shaped & ~full & (targets.holes > 0) if kind == "ring" else shaped & full
 
 
-def neighbours(targets: Targets, reach_px: float) -> tuple[np.ndarray, np.ndarray]:
-    """Find for each target the others whose boxes come within reach.
+def neighbours(targets: Targets, reach_px: np.ndarray | float, light_px: np.ndarray | float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """Find for each target the others that count for it: those whose boxes are within its reach, or their light within half of that.
+
+    Each has a reach and a light of its own, so that one blurred target does not give all others many neighbours.
+
+    Parameters
+    ----------
+    targets : Targets
+    reach_px : float or ndarray, shape (n,)
+    light_px : float or ndarray, shape (n,)
+        How far a target's light goes beyond its box.
 
     Returns
     -------
@@ -179,7 +188,8 @@ def neighbours(targets: Targets, reach_px: float) -> tuple[np.ndarray, np.ndarra
     from pixmetry.locate.detect._detect_kernels import boxes_in_reach
 
     box = np.stack([targets.row_first, targets.row_stop, targets.col_first, targets.col_stop], axis=1).astype(np.int64).reshape(-1, 4)
-    return boxes_in_reach(box, float(reach_px))
+    reach, light = (np.nan_to_num(np.broadcast_to(np.asarray(far, float), len(box))) for far in (reach_px, light_px))
+    return boxes_in_reach(box, reach, light)
 
 
 def _least_fill(targets: Regions) -> np.ndarray:

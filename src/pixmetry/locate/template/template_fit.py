@@ -62,7 +62,7 @@ class Windows:
         start, outer, edge = start_values(targets, kind, aperture_px)
         reach = np.stack([REACH * edge + 1.0, NEAR * edge + 0.5], axis=1)
         half = np.ceil(outer + reach[:, 0]).astype(np.int64)
-        near = neighbours(targets, float(2 * reach.max() + 2) if len(targets) else 1.0)
+        near = neighbours(targets, 2 * reach[:, 0] + 2, reach[:, 1] + 1)
         noise = scale_ends(noise, frame)
         efficiency = np.empty(0)
         if exact and noise.slope_dn > 0 and noise.pattern_rel == 0:
