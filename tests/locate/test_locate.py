@@ -20,7 +20,7 @@ from pixmetry.locate.detect.targets import Flag
 from pixmetry.locate.estimators import AUTO, estimators, methods
 from pixmetry.locate.frame import scale_ends
 from pixmetry.locate.lines.lines import line_model
-from pixmetry.locate.records import LOCATED_SCHEMA, ORIGIN, Located
+from pixmetry.locate.records import LOCATED_SCHEMA, ORIGIN, Located, joined
 
 SHAPE = (120, 160)
 Z_1E6 = 5.0  # |z| of the larger of a dozen coordinates, each beyond it with 6e-7
@@ -211,8 +211,8 @@ def test_the_noise_of_a_chessboard_is_not_taken_from_its_edges() -> None:
     assert 0.85 < np.median(seen.var_x_px2 / known.var_x_px2) < 1.15
 
 
-def test_targets_without_a_place_carry_no_code() -> None:
-    """Small, faint discs on a noisy ground, which operators lose: no error, and no number."""
+def test_targets_without_a_place_are_left_out_and_told() -> None:
+    """Small, faint discs on a noisy ground, which operators lose: no error, no number, no row, but a line with the reason."""
     rng = np.random.default_rng(1)
     frame = 20 + rng.normal(0, 1.5, (200, 200))
     y, x = np.indices(frame.shape)
@@ -221,7 +221,30 @@ def test_targets_without_a_place_carry_no_code() -> None:
         frame[np.hypot(x - a, y - b) < rng.uniform(0.7, 9)] = rng.uniform(40, 250)
     frame = np.clip(frame, 0, 255).astype(np.uint8)
     tables = [pixmetry.locate(frame, kind="coded", estimator=name) for name in OPERATORS]
-    assert any(np.isnan(table.x_px).any() for table in tables) and all((table.code == -1).all() for table in tables)
+    assert all((table.code == -1).all() and np.isfinite(table.x_px + table.var_x_px2).all() for table in tables)
+    lost = [table for table in tables if "the fit did not converge" in table.left_out.counted()]
+    assert lost and all("× the fit did not converge" in table.images[0]["left_out"] for table in lost)
+
+
+def test_what_has_another_shape_is_counted_and_in_every_file(tmp_path: Path) -> None:
+    """A bar and a disc: the bar is no row, and JSON, CSV and Parquet say where it is and why it was left out."""
+    import pyarrow.parquet
+
+    frame = frame_of()[0]
+    frame[3:7, 20:60] = 200
+    table = pixmetry.locate(frame, name="one")
+    lost = table.left_out
+    assert len(lost) == 1 and (lost.x_px[0], lost.y_px[0]) == pytest.approx((39.5, 4.5), abs=0.5)
+    assert lost.reason[0] == "not the shape of a disc" and lost.image[0] == "one" and lost.semi_major_px[0] > 15
+    for ending in ("csv", "json", "parquet"):
+        table.write(tmp_path / f"table.{ending}")
+    assert "left_out: 1 × not the shape of a disc" in (tmp_path / "table.csv").read_text()
+    (row,) = json.loads((tmp_path / "table.json").read_text())["left_out"]
+    assert row["reason"] == "not the shape of a disc" and row["x_px"] == pytest.approx(lost.x_px[0])
+    notes = pyarrow.parquet.read_metadata(tmp_path / "table.parquet").metadata
+    assert json.loads(notes[b"left_out"]) == [row]
+    both = joined([table, table])
+    assert len(both.left_out) == 2 and len(both) == 2 * len(table)
 
 
 @pytest.mark.parametrize(

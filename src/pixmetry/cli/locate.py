@@ -132,6 +132,8 @@ def locate(
         echo_lines(table.to_csv(), nl=False)
     for image in table.images:
         echo(f"{image['name']}: {image['targets']} found; {image['estimator']}: {image['reason']}", err=output is None)
+        if "left_out" in image:
+            echo(f"{image['name']}: left out: {image['left_out']}", err=output is None)
         if "file" in image:
             echo(f"{image['name']}: {image['file']}", err=output is None)
     if output is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -80,14 +81,14 @@ def locate_files(
         drawn = overlay_png(picture.array, table) if overlay is not None else b""
         if not picture.notes:
             return table, drawn
-        return Located(table.columns, table.kind, tuple({**image, "file": "; ".join(picture.notes)} for image in table.images)), drawn
+        return replace(table, images=tuple({**image, "file": "; ".join(picture.notes)} for image in table.images)), drawn
 
     tables: list[Located] = []
     drawings: list[bytes] = []
     results = map(work, files) if len(files) == 1 else imap_tiles(work, files)  # the threads share the images, or the one image
     for i, (table, drawing) in enumerate(results):
         drawings.append(drawing)
-        tables.append(Located({"image": np.full(len(table), frame_name(files[i])), **table.columns}, table.kind, table.images))
+        tables.append(replace(table, columns={"image": np.full(len(table), frame_name(files[i])), **table.columns}))
         report("locating", i + 1, len(files))
     found = joined(tables)
     contents = [found.content(one.path.suffix) for one in tables_at]

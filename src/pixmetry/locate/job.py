@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ from pixmetry.camera.camera import Camera
 from pixmetry.core.errors import InputError
 from pixmetry.locate.estimators import estimators, methods
 from pixmetry.locate.frame import checked_frame, scale_ends
-from pixmetry.locate.kinds import Task, grid_size, locate_chessboard, locate_lines, locate_spots
+from pixmetry.locate.kinds import Measured, Task, grid_size, locate_chessboard, locate_lines, locate_spots
 from pixmetry.locate.noise import NoiseModel, noise_model
 from pixmetry.locate.records import Located
 
@@ -63,7 +64,7 @@ def locate(
     Returns
     -------
     Located
-        A row a target; empty if there is none.
+        A row a target; empty if there is none. What was seen and has no position is in its ``left_out``, with the reason.
 
     Raises
     ------
@@ -97,6 +98,8 @@ def locate(
     model = noise_model(noise)
     low, high = scale_ends(image, bits, model)
     task = Task(image, kind, estimator, polarity, grid_size(grid, kind), model, low, high, aperture_px, light_on, threads, planes)
-    columns, notes = WORK.get(kind, locate_spots)(task)
-    about = {"name": name, "rows": image.shape[0], "cols": image.shape[1], "targets": len(columns["x_px"]), **notes}
-    return Located(columns, kind, (about,))
+    measured = Measured(*WORK.get(kind, locate_spots)(task))
+    about = {"name": name, "rows": image.shape[0], "cols": image.shape[1], "targets": len(measured.columns["x_px"]), **measured.notes}
+    if len(measured.left_out):
+        about["left_out"] = measured.left_out.sentence()
+    return Located(measured.columns, kind, (about,), replace(measured.left_out, image=np.full(len(measured.left_out), name)))

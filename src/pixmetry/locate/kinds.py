@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from pixmetry.core.errors import InputError
-from pixmetry.locate.detect.targets import Positions, Targets
+from pixmetry.locate.detect.targets import Flag, LeftOut, Positions, Targets
 from pixmetry.locate.estimator import Settings
 from pixmetry.locate.estimators import SPOTS, chosen_estimator, methods, seen_shape
+from pixmetry.locate.lines.line_candidates import LineCandidates
 from pixmetry.locate.noise import ROUNDING_DN2, NoiseModel
 from pixmetry.locate.records import LAST
 
+WITH_ARTICLE = {"disc": "a disc", "ellipse": "an ellipse", "ring": "a ring", "spot": "a spot"}
+UNSETTLED = "the fit did not converge"
 FAINTEST = 0.05  # height of lines and edges over that of the frame's strongest
 
 
@@ -35,13 +38,23 @@ class Task:
     planes: str | bool = "auto"
 
 
-def locate_spots(task: Task) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+class Measured(NamedTuple):
+    """What is known of a frame: columns, with a row a target; notes on what was chosen; and what was seen and is no row."""
+
+    columns: dict[str, np.ndarray]
+    notes: dict[str, Any]
+    left_out: LeftOut = LeftOut.of()
+
+
+def locate_spots(task: Task) -> Measured:
     """Targets that are regions: discs, ellipses, rings, spots, with or without a code, on a plate or not."""
-    from pixmetry.locate.detect.detection import detect, select
+    from pixmetry.locate.detect.detection import detect, seen_at, select
 
     found = detect(task.frame, polarity=task.polarity, high_dn=task.high_dn, low_dn=task.low_dn, threads=task.threads)
     shape = "ellipse" if task.kind == "coded" else task.kind
-    targets = found.targets[select(found.targets, shape)]
+    fits = select(found.targets, shape)
+    targets = found.targets[fits]
+    left_out = LeftOut.joined([found.left_out, seen_at(found.targets[~fits], f"not the shape of {WITH_ARTICLE[shape]}")])
     estimator, reason = task.estimator, "as was asked for"
     seen, why = seen_shape(shape, targets)
     noise = _noise_for(task, seen, targets)  # with the targets' own shape, whatever measures them: what it does not explain is noise
@@ -53,18 +66,21 @@ def locate_spots(task: Task) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     positions = methods()[estimator].positions(task.frame, targets, noise, settings)
     columns = _columns(positions, estimator if shape == task.kind else f"{estimator} ({shape})", noise)
     notes = _notes(estimator, reason, noise, found.polarity if len(targets) else "none found")
+    settled, whole = settled_ones(positions), np.ones(len(positions), bool)
     if task.kind == "coded":
-        columns = _coded(task, positions, columns)
+        columns, whole = _coded(task, positions, columns)
     if task.grid is not None:
         from pixmetry.locate.detect.grids import order_grid
 
         placed = order_grid(positions.x_px, positions.y_px, pattern=None if task.grid == "any" else task.grid)
         columns = _beside(columns, grid_col=placed.col, grid_row=placed.row)
-        notes["grid"] = placed.message or f"{placed.cols} x {placed.rows}, {int(placed.placed.sum())} of {len(positions)} targets placed"
-    return columns, notes
+        count = f"{int(placed.placed[settled].sum())} of {int(settled.sum())} targets placed"
+        notes["grid"] = placed.message or f"{placed.cols} x {placed.rows}, {count}"
+    left_out = LeftOut.joined([left_out, seen_at(targets[whole & ~settled], UNSETTLED)])
+    return Measured(_only(columns, whole & settled), notes, left_out)
 
 
-def locate_lines(task: Task) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+def locate_lines(task: Task) -> Measured:
     """Lines, edges, and crosses of two lines."""
     from pixmetry.locate.lines.line_detection import find_edges, find_lines
 
@@ -73,7 +89,9 @@ def locate_lines(task: Task) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     else:
         found = find_lines(task.frame, polarity=task.polarity, noise=task.noise, threads=task.threads)
     height = np.abs(found.amplitude_dn)
-    found = found[height >= FAINTEST * height.max(initial=0.0)]  # beside a strong one, what a coder or a halo draws is no line
+    real = height >= FAINTEST * height.max(initial=0.0)  # beside a strong one, what a coder or a halo draws is no line
+    left_out = [_lines_at(found[~real], f"lower than 1/{1 / FAINTEST:.0f} of the strongest")]
+    found = found[real]
     noise = _noise_for(task, task.kind, found.sigma_dn)
     estimator, reason = ("template", methods()["template"].text) if task.estimator == "auto" else (task.estimator, "as was asked for")
     if task.kind == "cross":
@@ -81,12 +99,22 @@ def locate_lines(task: Task) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
 
         crosses = crossings(found, task.frame.shape)
         positions = cross_positions(task.frame, crosses, noise, aperture_px=task.aperture_px, threads=task.threads)
+        settled = settled_ones(positions)
+        left_out.append(LeftOut.of(crosses.x_px[~settled], crosses.y_px[~settled], UNSETTLED))
     else:
         from pixmetry.locate.lines.lines import line_positions
 
         positions = line_positions(task.frame, found, noise, task.kind, estimator, aperture_px=task.aperture_px, threads=task.threads)
-    columns = _columns(_with_variance_factor(positions, noise), estimator, noise)
-    return columns, _notes(estimator, reason if len(positions) else f"no {task.kind} was found", noise, _polarity(positions))
+        settled = settled_ones(positions)
+        left_out.append(_lines_at(found[~settled], UNSETTLED))
+    columns = _only(_columns(_with_variance_factor(positions, noise), estimator, noise), settled)
+    notes = _notes(estimator, reason if len(positions) else f"no {task.kind} was found", noise, _polarity(positions))
+    return Measured(columns, notes, LeftOut.joined(left_out))
+
+
+def _lines_at(lines: LineCandidates, reason: str) -> LeftOut:
+    middle = 0.5 * (lines.x1_px + lines.x2_px), 0.5 * (lines.y1_px + lines.y2_px)
+    return LeftOut.of(*middle, reason, 0.5 * lines.length_px, lines.amplitude_dn)
 
 
 def _with_variance_factor(positions: Positions, noise: NoiseModel) -> Positions:
@@ -111,7 +139,7 @@ def _polarity(positions: Positions) -> str:
     return "none found" if not len(positions) else "bright" if (signs > 0).all() else "dark" if (signs < 0).all() else "both"
 
 
-def locate_chessboard(task: Task) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+def locate_chessboard(task: Task) -> Measured:
     """Inner corners of a chessboard of a given size."""
     from pixmetry.locate.detect.background import background
     from pixmetry.locate.template.corners import chessboard_reach_px, corner_positions, find_chessboard
@@ -134,7 +162,9 @@ def locate_chessboard(task: Task) -> tuple[dict[str, np.ndarray], dict[str, Any]
     columns = _columns(positions, "template", noise)
     reason = found.message or "two crossing edges, integrated over the pixel; at the Cramér–Rao bound"
     columns = _beside(columns, grid_col=found.col, grid_row=found.row)
-    return columns, _notes("template", reason, noise, "none found" if found.message else "both")
+    settled = settled_ones(positions)
+    left_out = LeftOut.of(found.x_px[~settled], found.y_px[~settled], UNSETTLED)
+    return Measured(_only(columns, settled), _notes("template", reason, noise, "none found" if found.message else "both"), left_out)
 
 
 def _noise_for(task: Task, kind: str, targets: Targets | np.ndarray) -> NoiseModel:
@@ -183,16 +213,27 @@ def _notes(estimator: str, reason: str, noise: NoiseModel, polarity: str) -> dic
     return {"polarity": polarity, "estimator": estimator, "reason": reason, "noise_model": noise.describe()}
 
 
-def _coded(task: Task, positions: Positions, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The columns with each target's code, without the segments of the rings; a target that was lost has the code −1."""
+def _coded(task: Task, positions: Positions, columns: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """The columns with each target's code, and which targets are no segments of a ring; a target that was lost has the code −1."""
     from pixmetry.locate.detect.coded import read_codes, ring_members
 
     x, y, more = positions.x_px, positions.y_px, positions.more
     major, minor, angle = more["semi_major_px"], more["semi_minor_px"], more["angle_deg"]
     codes = read_codes(task.frame, x, y, major, minor, angle, more["amplitude_dn"], threads=task.threads)
     whole = ~ring_members(x, y, major, minor, angle, codes.number)
-    columns = {name: values[whole] for name, values in columns.items()} | {"target": np.arange(int(whole.sum()))}
-    return _beside(columns, code=codes.number[whole], code_margin=codes.margin[whole])
+    return _beside(columns, code=codes.number, code_margin=codes.margin), whole
+
+
+def settled_ones(positions: Positions) -> np.ndarray:
+    """Which positions may be used: those that are there, of fits that converged; shape (n,), bool."""
+    there = np.isfinite(positions.x_px) & np.isfinite(positions.y_px) & np.isfinite(positions.var_x_px2) & np.isfinite(positions.var_y_px2)
+    settled: np.ndarray = there & (positions.flags & np.uint32(Flag.NOT_CONVERGED) == 0)
+    return settled
+
+
+def _only(columns: dict[str, np.ndarray], which: np.ndarray) -> dict[str, np.ndarray]:
+    """Some rows of the columns, numbered anew."""
+    return {name: values[which] for name, values in columns.items()} | {"target": np.arange(int(which.sum()))}
 
 
 def _beside(columns: dict[str, np.ndarray], **more: np.ndarray) -> dict[str, np.ndarray]:

@@ -6,7 +6,7 @@ import csv
 import io
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from pixmetry.core.extras import import_extra
 from pixmetry.core.plain_text import cell, comment
 from pixmetry.files.output import Output, check_files, write_together
 from pixmetry.files.strict_json import json_text
-from pixmetry.locate.detect.targets import Flag
+from pixmetry.locate.detect.targets import Flag, LeftOut
 
 LOCATED_SCHEMA = "pixmetry/located/1"
 ORIGIN = "(0, 0) is the centre of the top-left pixel, x to the right, y down"
@@ -34,7 +34,7 @@ LAST = ("estimator", "noise_model", "flags")  # columns, in every table
 
 @dataclass(frozen=True)
 class Located:
-    """Positions of targets in one or several images, a row a target.
+    """Positions of targets in one or several images, a row a target; and what was seen there and has no position.
 
     Each column is an attribute and an item: ``table.x_px`` and ``table["x_px"]`` are arrays of shape (n,).
 
@@ -46,7 +46,9 @@ class Located:
     kind : str
     images : tuple of dict
         Of each image: ``name``, ``rows``, ``cols``, ``targets``, ``polarity``, ``estimator``, ``reason`` (why
-        this estimator), ``noise_model``.
+        this estimator), ``noise_model``, and where something was left out ``left_out`` (how many, and why).
+    left_out : LeftOut
+        What was seen and is no row: fits that did not converge, other shapes, halos of other targets.
 
     Examples
     --------
@@ -62,6 +64,7 @@ class Located:
     columns: dict[str, np.ndarray]
     kind: str
     images: tuple[dict[str, Any], ...] = field(default_factory=tuple)
+    left_out: LeftOut = field(default_factory=LeftOut.of)
 
     def __len__(self) -> int:
         return len(self.columns["x_px"])
@@ -98,6 +101,7 @@ class Located:
             "images": list(self.images),
             "columns": list(self.columns),
             "targets": [dict(zip(self.columns, row, strict=True)) for row in self._rows()],
+            "left_out": self._left_out(),
         }
 
     def write(self, path: str | Path) -> Path:
@@ -179,6 +183,11 @@ class Located:
                 columns.append(values.tolist())
         return [list(row) for row in zip(*columns, strict=True)]
 
+    def _left_out(self) -> list[dict[str, Any]]:
+        columns = {f.name: getattr(self.left_out, f.name) for f in fields(self.left_out)}
+        kept = {name: [_finite(v) for v in values.tolist()] for name, values in columns.items()}
+        return [dict(zip(kept, row, strict=True)) for row in zip(*kept.values(), strict=True)]
+
     def _comments(self) -> list[str]:
         lines = [f"pixmetry {LOCATED_SCHEMA}; kind {self.kind}; origin: {ORIGIN}"]
         for image in self.images:
@@ -205,7 +214,8 @@ class Located:
 
         columns: dict[str, Any] = {**self.columns, "flags": self.flag_words}
         table = pyarrow.table({name: pyarrow.array(values) for name, values in columns.items()})
-        notes = {"schema": LOCATED_SCHEMA, "kind": self.kind, "origin": ORIGIN, "images": json.dumps(list(self.images), ensure_ascii=False)}
+        notes = {"schema": LOCATED_SCHEMA, "kind": self.kind, "origin": ORIGIN}
+        notes |= {name: json.dumps(v, ensure_ascii=False) for name, v in (("images", list(self.images)), ("left_out", self._left_out()))}
         sink = io.BytesIO()
         pyarrow.parquet.write_table(table.replace_schema_metadata(notes), sink)
         return sink.getvalue()
@@ -239,7 +249,12 @@ def joined(tables: Sequence[Located]) -> Located:
         kinds = {t.columns[name].dtype.kind for t in tables if name in t.columns}
         empty: Any = np.nan if "f" in kinds else "" if kinds <= {"U"} else -1
         columns[name] = np.concatenate([t.columns[name] if name in t.columns else np.full(len(t), empty) for t in tables])
-    return Located(columns, tables[0].kind, tuple(image for t in tables for image in t.images))
+    images = tuple(image for t in tables for image in t.images)
+    return Located(columns, tables[0].kind, images, LeftOut.joined([t.left_out for t in tables]))
+
+
+def _finite(value: Any) -> Any:
+    return value if not isinstance(value, float) or np.isfinite(value) else None
 
 
 def _short(value: Any) -> Any:

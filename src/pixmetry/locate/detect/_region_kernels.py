@@ -6,8 +6,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from pixmetry.core.arrays import Array, Flags, Ints, Singles
+from pixmetry.core.arrays import Array, Ints, Singles
 from pixmetry.core.jit import jit
 from pixmetry.locate.detect._background_kernels import Map, map_at
 from pixmetry.locate.detect._detect_kernels import RUN, Runs, doubled, group_runs, join_runs
@@ -21,6 +22,7 @@ GROWTHS = 5  # of the window in which a faint target is looked for
 SEED = 1.5  # height of a top over the threshold, for a region to be more than noise
 HALO, RINGING, REACH = 0.4, 0.08, 12.0  # see `spurious`
 FIELDS = 17  # of a target: see `describe` and `measure_regions`
+TWICE, GLARE = 1, 2  # why a target is none of its own: see `spurious`
 BORDER, SATURATED, CLIPPED, OVERLAPPING = 1, 2, 4, 16  # of `targets.Flag`
 
 
@@ -404,14 +406,14 @@ def simple(region: Runs, target: Array) -> bool:
 
 
 @jit
-def spurious(targets: Outlines, start: Ints, index: Ints) -> Flags:
-    """Targets that are another one's doing: the same one found twice, the halo of a sharpened edge, the ringing of a compressed one.
+def spurious(targets: Outlines, start: Ints, index: Ints) -> NDArray[np.int8]:
+    """Targets that are another one's doing: TWICE, the same one found again; GLARE, a sharpened edge's halo or a compressed one's ringing.
 
     ``start`` and ``index`` say which targets are near each other. A halo has the other sign, less than HALO of the height, and lies at the
     edge; ringing has less than RINGING of the height and lies within REACH pixels, a block of the coder.
     """
     x, y, major, minor, angle, blur, amplitude, box = targets
-    drop = np.zeros(len(x), np.bool_)
+    cause = np.zeros(len(x), np.int8)
     for i in range(len(x)):
         for k in range(start[i], start[i + 1]):
             j = index[k]
@@ -422,7 +424,8 @@ def spurious(targets: Outlines, start: Ints, index: Ints) -> Flags:
                 edge = major[j] * minor[j] / math.hypot(minor[j] * math.cos(turn), major[j] * math.sin(turn))
                 gap = math.hypot(dx, dy) - edge
                 halo = ratio < 0.0 and gap < minor[i] + 2.0 + 3.0 * blur[j]
-                drop[i] |= halo or (abs(ratio) < RINGING and gap < REACH)
-            elif j < i and ratio > 0.0 and not drop[j] and np.abs(box[i] - box[j]).max() <= 1:
-                drop[i] = True
-    return drop
+                if halo or (abs(ratio) < RINGING and gap < REACH):
+                    cause[i] = GLARE
+            elif j < i and ratio > 0.0 and cause[j] == 0 and np.abs(box[i] - box[j]).max() <= 1:
+                cause[i] = TWICE
+    return cause

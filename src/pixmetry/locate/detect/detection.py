@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 
 from pixmetry.core.errors import InputError
 from pixmetry.core.threads import map_tiles
 from pixmetry.locate.detect.background import Background, background, bands_of, scale_of
-from pixmetry.locate.detect.targets import Flag, Targets
+from pixmetry.locate.detect.targets import Flag, LeftOut, Targets
 
 POLARITIES = ("auto", "bright", "dark")
 KINDS = ("disc", "ellipse", "ring", "spot")
@@ -59,12 +59,15 @@ class Detection:
         Typical standard deviation of the background's noise.
     polarity : {"bright", "dark", "both", "none"}
         Of the targets.
+    left_out : LeftOut
+        What other targets cause.
     """
 
     targets: Regions
     background: Background
     sigma_dn: float
     polarity: str
+    left_out: LeftOut = field(default_factory=LeftOut.of)
 
 
 def detect(
@@ -135,10 +138,10 @@ def detect(
         zip(shares[:-1], [*shares[1:-1], len(start) - 1], strict=True),
         threads,
     )
-    targets = _genuine(_targets(np.concatenate(parts), ground))
+    targets, left_out = _genuine(_targets(np.concatenate(parts), ground))
     bright, dark = bool((targets.amplitude_dn > 0).any()), bool((targets.amplitude_dn < 0).any())
     kind = "both" if bright and dark else "bright" if bright else "dark" if dark else "none"
-    return Detection(targets, ground, float(np.median(ground.sigma_dn)), kind)
+    return Detection(targets, ground, float(np.median(ground.sigma_dn)), kind, left_out)
 
 
 def _tame(sigma_dn: np.ndarray) -> np.ndarray:
@@ -209,15 +212,22 @@ def _fits_box(targets: Regions) -> np.ndarray:
     return fits
 
 
-def _genuine(targets: Regions) -> Regions:
-    """Leave out false targets that other targets cause."""
-    from pixmetry.locate.detect._region_kernels import REACH, Outlines, spurious
+def _genuine(targets: Regions) -> tuple[Regions, LeftOut]:
+    """Leave out false targets that other targets cause; what is the same target found twice is not told."""
+    from pixmetry.locate.detect._region_kernels import GLARE, REACH, Outlines, spurious
 
     t = targets
     box = np.stack([t.row_first, t.row_stop, t.col_first, t.col_stop], axis=1)
     outlines = Outlines(t.x_px, t.y_px, t.semi_major_px, t.semi_minor_px, t.angle_deg, t.blur_px, t.amplitude_dn, box)
-    drop = spurious(outlines, *neighbours(t, REACH))
-    return t[~drop] if drop.any() else t
+    cause = spurious(outlines, *neighbours(t, REACH))
+    if not cause.any():
+        return t, LeftOut.of()
+    return t[cause == 0], seen_at(t[cause == GLARE], "a halo, or the ringing of a coder, beside a target")
+
+
+def seen_at(targets: Targets, reason: str) -> LeftOut:
+    """Return targets as what was left out for a reason."""
+    return LeftOut.of(targets.x_px, targets.y_px, reason, targets.semi_major_px, targets.amplitude_dn)
 
 
 def _targets(table: np.ndarray, ground: Background) -> Regions:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, fields
 from enum import IntFlag
 
@@ -19,7 +20,7 @@ class Flag(IntFlag):
     GRADIENT = 32  # the light falls off across the target, significantly
     UNEVEN_BACKGROUND = 64  # the background slopes under the target, significantly
     POOR_FIT = 128  # the residuals are larger than the noise
-    NOT_CONVERGED = 256  # the fit did not come to rest, or far from knows the place; not to be used
+    NOT_CONVERGED = 256  # the fit did not come to rest, or far from knows the place; such targets are left out of tables
     FAINT = 512  # so little contrast that the covariance, which is of first order, is too small
 
     def words(self) -> str:
@@ -102,3 +103,71 @@ class Positions:
 
     def __len__(self) -> int:
         return len(self.x_px)
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """What was seen in an image and has no position in its table, and why; arrays of shape (n,).
+
+    Parameters
+    ----------
+    x_px, y_px : ndarray
+        Where it was seen, roughly.
+    semi_major_px : ndarray
+        Half its length, roughly; NaN where it is not known.
+    amplitude_dn : ndarray
+        Height over the background, negative for dark ones; NaN where it is not known.
+    reason : ndarray of str
+        Why it has no position, in words.
+    image : ndarray of str
+        Name of its image.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from pixmetry.locate.detect.targets import LeftOut
+    >>> lost = LeftOut.of(np.array([3.0, 5.0]), np.array([4.0, 4.0]), "the fit did not converge", image="a")
+    >>> lost.counted()
+    {'the fit did not converge': 2}
+    """
+
+    x_px: np.ndarray
+    y_px: np.ndarray
+    semi_major_px: np.ndarray
+    amplitude_dn: np.ndarray
+    reason: np.ndarray
+    image: np.ndarray
+
+    @classmethod
+    def of(
+        cls,
+        x_px: Iterable[float] = (),
+        y_px: Iterable[float] = (),
+        reason: str = "",
+        semi_major_px: np.ndarray | None = None,
+        amplitude_dn: np.ndarray | None = None,
+        image: str = "",
+    ) -> LeftOut:
+        """Make one of places that have a reason in common; without places, an empty one."""
+        x, y = np.array(x_px, float), np.array(y_px, float)
+        unknown = np.full(len(x), np.nan)
+        major = unknown if semi_major_px is None else np.asarray(semi_major_px, float)
+        height = unknown if amplitude_dn is None else np.asarray(amplitude_dn, float)
+        return cls(x, y, major, height, np.full(len(x), reason), np.full(len(x), image))
+
+    @classmethod
+    def joined(cls, parts: Sequence[LeftOut]) -> LeftOut:
+        """Put several under each other."""
+        return cls(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)}) if parts else cls.of()
+
+    def __len__(self) -> int:
+        return len(self.x_px)
+
+    def counted(self) -> dict[str, int]:
+        """How many have each reason, the most frequent first."""
+        reasons, counts = np.unique(self.reason, return_counts=True)
+        return {str(reasons[i]): int(counts[i]) for i in np.argsort(-counts, kind="stable")}
+
+    def sentence(self) -> str:
+        """Say how many there are for each reason; empty if there are none."""
+        return "; ".join(f"{n} × {reason}" for reason, n in self.counted().items())
