@@ -10,6 +10,7 @@ import pytest
 from scipy import ndimage
 
 from pixmetry.assess.job import measure_sources
+from pixmetry.observe.mosaic import _scatter_dn4
 from pixmetry.observe.observe import Group, observe
 
 SHAPE, GAIN, NOISE_E, OFFSET, TOP = (120, 160), 0.5, 10.0, 80.0, 4095
@@ -72,6 +73,22 @@ def test_method_colour_pattern_and_gain(rng, stored, method, output, pattern):
     assert abs(gain.value - GAIN) < Z * gain.u
     assert abs(noise.value - NOISE_E) < Z * noise.u
     assert gain.u < 0.015 * GAIN
+
+
+def test_scatter_of_the_covariances_of_interpolated_noise(rng):
+    """Sum of squares of what is found over what is true: a quarter more than of white noise."""
+    frames = np.array([red(rng.standard_normal(SHAPE), "GRBG") for _ in range(500)])[:, 4:-8, 4:-8]
+
+    def products(j: int, i: int) -> np.ndarray:
+        """Mean over a frame, by place."""
+        rows, cols = SHAPE[0] - 20, SHAPE[1] - 20
+        moved = frames[:, j : j + rows, 4 + i : 4 + i + cols] * frames[:, :rows, 4 : 4 + cols]
+        return np.array([[moved[:, r::2, c::2].mean(axis=(1, 2)) for c in (0, 1)] for r in (0, 1)])
+
+    found = np.array([[products(j, i) for i in range(-4, 5)] for j in range(5)]).transpose(2, 3, 0, 1, 4)
+    pixels = (SHAPE[0] - 20) * (SHAPE[1] - 20)
+    expected = found.var(axis=4, ddof=1).sum()
+    assert _scatter_dn4(found.mean(axis=4), pixels) == pytest.approx(expected, rel=0.2)
 
 
 def test_luminance_tells_no_gain(rng):

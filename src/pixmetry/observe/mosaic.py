@@ -19,6 +19,7 @@ METHODS, OUTPUTS = (BILINEAR, MALVAR), {"green": ("RGGB", "GRBG"), "red": ("RGGB
 WORTH = 1.5  # by how much a method that mixes colours must fit better: without noise in the others it is the plain one
 FOUND_Z = 8.0  # of the variances of the four places against their mean
 LEFT_OVER = 0.03  # of the covariances, root of their sum of squares over that of all, that a method may leave beside the scatter
+SCATTERS = 2.0  # of the scatter's expected root, that a right method may leave: few squares make most of the sum
 
 
 @dataclass(frozen=True)
@@ -38,21 +39,21 @@ class Mosaic:
     original: np.ndarray
 
 
-def find_mosaic(shot_dn2: np.ndarray, pixels: float) -> Mosaic | None:
+def find_mosaic(shot_dn2: np.ndarray, dark_dn2: np.ndarray, pixels: float) -> Mosaic | None:
     """The method, stored colour and place of the colours that explain the noise; None where its variance has no period of two pixels.
 
     Parameters
     ----------
-    shot_dn2 : ndarray, shape (2, 2, 5, 9)
-        Autocovariance of the shot noise at the four places; see `NoiseCovariance`.
+    shot_dn2, dark_dn2 : ndarray, shape (2, 2, 5, 9)
+        Autocovariance of the shot noise, and of the dark, at the four places; see `NoiseCovariance`.
     pixels : float
-        Number of independent pixels that it is the mean of, over all places.
+        Number of pixels that the first is the mean of, over all places.
     """
     variances = shot_dn2[:, :, 0, REACH]
     u = variances.mean() * np.sqrt(8 / pixels)
     if np.abs(variances - variances.mean()).max() < FOUND_Z * u:
         return None
-    scatter = np.sqrt(shot_dn2.size * 4 / pixels) * variances.mean() / np.linalg.norm(shot_dn2)
+    scatter = float(np.sqrt(_scatter_dn4(shot_dn2 + dark_dn2, pixels)) / np.linalg.norm(shot_dn2))
     best, found = np.inf, None
     for method in METHODS:
         for output, patterns in OUTPUTS.items():
@@ -63,7 +64,29 @@ def find_mosaic(shot_dn2: np.ndarray, pixels: float) -> Mosaic | None:
                 fewest = method == BILINEAR and output != "luma"  # colours in the noise of one pixel
                 if left * (1.0 if fewest else WORTH) < best:
                     best, found = left, Mosaic(method, output, pattern, original)
-    return found if best < np.hypot(LEFT_OVER, 1.5 * scatter) else None
+    return found if best < np.hypot(LEFT_OVER, SCATTERS * scatter) else None
+
+
+def _scatter_dn4(covariance_dn2: np.ndarray, pixels: float) -> float:
+    """Expected sum of squares of what is measured of an autocovariance by place, shape (2, 2, 5, 9), over its true values.
+
+    Bartlett's formula, Σ c(h) c'(h) + c(h + k) c'(h − k), over the distances h from one pixel of a place to another: noise that
+    neighbours share scatters more than white noise of its variance.
+    """
+
+    def at(r: int, c: int, j: int, i: int) -> float:
+        """Covariance of a pixel at a place with that (j, i) from it."""
+        if j < 0:
+            r, c, j, i = (r + j) % 2, (c + i) % 2, -j, -i
+        return float(covariance_dn2[r, c, j, i + REACH]) if j <= REACH and abs(i) <= REACH else 0.0
+
+    apart = [2 * n for n in range(-(REACH // 2), REACH // 2 + 1)]
+    total = 0.0
+    for r, c, j, i in np.ndindex(2, 2, REACH + 1, 2 * REACH + 1):
+        i -= REACH
+        other = (r + j) % 2, (c + i) % 2
+        total += sum(at(r, c, y, x) * at(*other, y, x) + at(r, c, y + j, x + i) * at(*other, y - j, x - i) for y in apart for x in apart)
+    return 4 * total / pixels
 
 
 @cache

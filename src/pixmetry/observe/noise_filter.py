@@ -303,7 +303,7 @@ def _of_mosaic(plain: NoiseFilter, seen: NoiseCovariance, part: _ShotPart) -> No
     if not (bright.any() and dark.any()):
         return None
     shot, black, pixels = shot_of_places(seen, bright, dark)
-    found = find_mosaic(shot, pixels)
+    found = find_mosaic(shot, black, pixels)
     if found is None:
         return None
     settings = {"method": found.method, "output": found.output} | ({} if found.output == "luma" else {"pattern": found.pattern})

@@ -29,12 +29,11 @@ BY_CHANCE = 1e-6  # probability that some group of pictures stands out as much w
 TILTED = 5.0  # standard deviations by which a change of the coarse over the fine part stands out
 NEARLY = 1.5  # ratio of sums of squares, below which another period describes them as well
 FREEZES = 0.02  # of the noise variance: what a lossy coder takes away at least
-BLOCK = 4  # px, the smallest that is transformed
+BLOCK, MACROBLOCK = 4, 16  # px, the smallest that is transformed; the one whose rounding follows its content
 LUMPY, TILT = 0.15, 0.03  # by which the kurtosis of the noise rises, and the logarithm of its coarse over its fine part
-CODERS: tuple[tuple[Any, Any], ...] = (("h264", "qp"), ("h264", "crf"), ("hevc", "qp"), ("hevc", "crf"))
-COARSEST_FIRST = 2
-QUALITIES, COARSE = (1, 51), 3  # quantisers, and the step of those that are tried first
-MISFIT, ALIKE = 0.05, 0.003  # sum of squares of the logarithms of four traces: of another coder; of quantisers that are not told apart
+QUALITIES, COARSEST_FIRST, COARSE = (1, 51), 2, 3  # quantisers, and the first and the step of those that are tried first
+MISFIT, ALIKE = 0.05, 0.003  # sum of squares of the logarithms of the traces: of another coder; of quantisers that are not told apart
+ALIKE_REL = 4.0  # of the best misfit, up to which another is as good
 CLEARLY = 0.25  # of the misfit three quantisers off, above which the best one is not the right one
 U_QUALITY = 1.0  # one coder decides not quite as another
 LEAST_CONTRAST = 30.0  # of the scene's power over that of the noise, at a frequency that is compared
@@ -446,20 +445,30 @@ def _period(values: Array) -> int | None:
 
 
 def traces_of(frames: np.ndarray) -> Array:
-    """Mean square of the difference to the frame before, its coarse and its fine part in DN², and its kurtosis: medians over the frames.
+    """Mean square of the difference to the frame before, its coarse and its fine part in DN², its kurtosis, and that of busy over calm.
 
-    Fine parts are rounded to 0 first, and rounding adds to the coarse ones. It leaves few coefficients that are large: noise that was
-    normal then has a kurtosis above 3. Coarse and fine are block coefficients of low and of high order.
+    Medians over the frames. Fine parts are rounded to 0 first, and rounding adds to the coarse ones. It leaves few coefficients that are
+    large: noise that was normal then has a kurtosis above 3. Coarse and fine are block coefficients of low and of high order. A coder that
+    adapts to the content rounds blocks with much contrast more coarsely than calm ones: the mean square of one half of the blocks over that
+    of the other, by their contrast in the mean of the frames.
     """
     differences = np.diff(frames, axis=0)
-    rows, cols = (n // BLOCK * BLOCK for n in frames.shape[1:])
-    tiles = differences[:, :rows, :cols].reshape(len(differences), rows // BLOCK, BLOCK, cols // BLOCK, BLOCK)
-    found = dctn(tiles, axes=(2, 4), norm="ortho")
-    second, fourth = (np.mean(found**power, axis=(1, 3)) for power in (2, 4))
+    powers = np.square(dctn(_tiles(differences, BLOCK), axes=(2, 4), norm="ortho"))
+    second, fourth = powers.mean(axis=(1, 3)), np.square(powers).mean(axis=(1, 3))
     kurtosis = np.median(fourth / np.maximum(second, 1e-12) ** 2, axis=(1, 2))
     coarse, fine = second[:, [0, 0, 1], [0, 1, 0]].mean(axis=1), second[:, 2:, 2:].mean(axis=(1, 2))
-    traces = np.array([np.square(differences).mean(axis=(1, 2), dtype=float), coarse, fine, kurtosis])
+    contrast = _tiles(frames.mean(axis=0)[None], MACROBLOCK).var(axis=(2, 4))[0]
+    busy = contrast > np.median(contrast)
+    sizes = np.square(_tiles(differences, MACROBLOCK)).mean(axis=(2, 4))
+    share = sizes[:, busy].mean(axis=1) / np.maximum(sizes[:, ~busy].mean(axis=1), 1e-6) if busy.any() else np.ones(len(differences))
+    traces = np.array([np.square(differences).mean(axis=(1, 2), dtype=float), coarse, fine, kurtosis, share])
     return np.asarray(np.median(traces, axis=1), float)
+
+
+def _tiles(frames: np.ndarray, side: int) -> np.ndarray:
+    """Whole tiles of the frames, shape (n, rows of tiles, side, columns of tiles, side)."""
+    rows, cols = (n // side for n in frames.shape[1:])
+    return frames[:, : rows * side, : cols * side].reshape(len(frames), rows, side, cols, side)
 
 
 def _coder(before: np.ndarray, after: np.ndarray, squares: Array, noise: Estimates, correlation: Estimates, depth_bits: int) -> Estimates:
@@ -485,48 +494,89 @@ def _coder(before: np.ndarray, after: np.ndarray, squares: Array, noise: Estimat
     else:
         told = Estimates.from_rows([("group", float(group), 0.1, np.inf, "1")], method=METHOD)
     try:
-        return told.join(_quality(before, told_of, group or len(before), depth_bits))
+        return told.join(_quality(before, after, group, depth_bits))
     except InputError as problem:
         return told.join(_untold(("quality",), str(problem)))
 
 
-def _quality(before: np.ndarray, wanted: Array, group: int, depth_bits: int) -> Estimates:
+def _quality(before: np.ndarray, after: np.ndarray, group: int | None, depth_bits: int) -> Estimates:
     """Quantiser with which a coder leaves the same traces in the direct frames, by trying."""
     side = [slice(max(0, (n - MOST_SIDE) // 2 // 16 * 16), max(0, (n - MOST_SIDE) // 2 // 16 * 16) + MOST_SIDE) for n in before.shape[1:]]
-    frames = before[:MOST_TRIED, side[0], side[1]].astype(np.uint8 if depth_bits == 8 else np.uint16)
-    part, whole = traces_of(before[:, side[0], side[1]]), traces_of(before)
-    aim = wanted * part / whole  # in the part of the frames that is tried
-    ways: list[tuple[float, int, dict[int, float], dict[str, str | int]]] = []
-    for codec, control in CODERS:
-        if depth_bits not in DEPTHS[codec]:
+    direct = before[:, side[0], side[1]].astype(np.uint8 if depth_bits == 8 else np.uint16)
+    # differences fall from one picture coded by itself to the next: a trial begins where the recorded frames do, behind a whole group
+    count, ahead = len(after), 0
+    if group is None or group > MOST_TRIED:
+        count = min(count, MOST_TRIED)
+    elif group > 1:
+        count = min(count, max(MOST_TRIED, 3 * group))
+        ahead = 2 * group - 1 - _first_of_group(after[:count], group)
+    aim = traces_of(after[:count, side[0], side[1]])
+    setting = {"group": min(group or len(before), 1000), "depth_bits": depth_bits}
+    frames = direct[np.arange(ahead + count) % len(direct)]
+    ways: list[_Trial] = []
+    for codec in DEPTHS:
+        if codec == "ffv1" or depth_bits not in DEPTHS[codec]:
             continue
-        own = _tried(frames, aim, {"codec": codec, "control": control, "group": min(group, 1000), "depth_bits": depth_bits})
-        best = min(own, key=lambda q: own[q])
-        ways.append((own[best], best, own, {"codec": codec, "control": control, "depth_bits": depth_bits}))
-        if own[best] < MISFIT:
+        one = _trial(frames, ahead, aim, setting | {"codec": codec, "control": "qp"}, range(COARSEST_FIRST, QUALITIES[1] + 1, COARSE))
+        by_content = range(max(QUALITIES[0], one.quality - 4 * COARSE), min(QUALITIES[1], one.quality + 2 * COARSE) + 1, COARSE)
+        ways += [one, _trial(frames, ahead, aim, setting | {"codec": codec, "control": "crf"}, by_content)]
+        if min(way.misfit for way in ways) < MISFIT:
             break
-    misfit, best, tried, settings = min(ways, key=lambda way: way[0])
-    farther = min(d for q, d in tried.items() if abs(q - best) >= COARSE)
-    if misfit > max(MISFIT, CLEARLY * farther):
+    limit = max(ALIKE_REL * min(way.misfit for way in ways), ALIKE)
+    best, *rivals = [way for way in ways if way.misfit < limit]
+    farther = min(d for q, d in best.tried.items() if abs(q - best.quality) >= COARSE)
+    if best.misfit > max(MISFIT, CLEARLY * farther):
         return _untold(("quality",), "no quantiser of H.264 or HEVC leaves such noise: another coder, or noise reduction")
-    alike = [q for q, d in tried.items() if d < max(4 * tried[best], ALIKE)]
+    confounders = tuple(f"quantiser {best.quality} of {best.name}: {way.quality} of {way.name} leaves such noise too" for way in rivals)
+    alike = [q for q, d in best.tried.items() if d < limit]
     u = float(np.hypot(U_QUALITY, (max(alike) - min(alike)) / np.sqrt(12)))
-    if best - ONE_SIDED_95 * u < QUALITIES[0]:
+    settings: dict[str, str | int] = {"codec": best.codec, "control": best.control, "depth_bits": depth_bits}
+    if best.quality - ONE_SIDED_95 * u < QUALITIES[0]:
         why = {"quality": "so fine that the noise hides it; 95 % upper limit"}
-        row = ("quality", min(best + ONE_SIDED_95 * u, float(QUALITIES[1])), u, np.inf, "1")
+        row = ("quality", min(best.quality + ONE_SIDED_95 * u, float(QUALITIES[1])), u, np.inf, "1")
         return Estimates.from_rows([row], method=CODER, limits=frozenset(["quality"]), reasons=why, settings=settings)
-    return Estimates.from_rows([("quality", float(best), u, np.inf, "1")], method=CODER, settings=settings)
+    row = ("quality", float(best.quality), u, np.inf, "1")
+    return Estimates.from_rows([row], method=CODER, settings=settings, confounders=confounders)
 
 
-def _tried(frames: np.ndarray, aim: Array, setting: dict[str, Any]) -> dict[int, float]:
-    """Misfit of the traces by quantiser: every third one, then those near the best."""
+def _first_of_group(after: np.ndarray, group: int) -> int:
+    """The first of the recorded frames that is coded by itself, less one: the phase of the largest differences."""
+    squares = np.square(np.diff(after, axis=0)).mean(axis=(1, 2), dtype=float)
+    return max(range(group), key=lambda phase: float(squares[phase::group].mean()) if len(squares) > phase else 0.0)
 
-    def apart(quality: int) -> float:
+
+@dataclass(frozen=True)
+class _Trial:
+    """What a coder makes of the direct frames: misfit of the traces by quantiser, and the best of them."""
+
+    codec: str
+    control: str
+    tried: dict[int, float]
+
+    @property
+    def name(self) -> str:
+        """What a user sets."""
+        how = "one quantiser for all (qp)" if self.control == "qp" else "a quantiser by the content (crf)"
+        return f"{self.codec} with {how}"
+
+    @property
+    def quality(self) -> int:
+        return min(self.tried, key=lambda q: self.tried[q])
+
+    @property
+    def misfit(self) -> float:
+        return self.tried[self.quality]
+
+
+def _trial(frames: np.ndarray, ahead: int, aim: Array, setting: dict[str, Any], coarse: range) -> _Trial:
+    """Quantisers of a coarse range on few frames, then those near the best on all; the first ``ahead`` frames leave no traces."""
+
+    def apart(quality: int, played: np.ndarray, left_out: int) -> float:
         coder = Coder(VideoCodec(quality=quality, **setting))
-        found = traces_of(np.array([coder.follow(f) for f in frames], np.float32))
+        found = traces_of(np.array([coder.follow(f) for f in played], np.float32)[left_out:])
         return float(np.square(np.log(np.maximum(found, 1e-6) / np.maximum(aim, 1e-6))).sum())
 
-    tried = {q: apart(q) for q in range(COARSEST_FIRST, QUALITIES[1] + 1, COARSE)}
+    tried = {q: apart(q, frames[:MOST_TRIED], 0) for q in coarse}
     best = min(tried, key=lambda q: tried[q])
     near = range(max(QUALITIES[0], best - COARSE + 1), min(QUALITIES[1], best + COARSE - 1) + 1)
-    return tried | {q: apart(q) for q in near if q not in tried}
+    return _Trial(setting["codec"], setting["control"], tried | {q: apart(q, frames, ahead) for q in near})
