@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from pixmetry.assess.digital_twin import ASSUMED_RANGE_E, digital_twin, of_unit
+from pixmetry.assess.draft import draft_campaign
 from pixmetry.assess.located_frames import with_located
 from pixmetry.assess.page.page import write_report
 from pixmetry.assess.results import Assessment
@@ -41,6 +42,7 @@ from pixmetry.files import (
     write_maps,
     write_record,
 )
+from pixmetry.files.manifest import NoCampaign
 from pixmetry.files.records import LOCATED, FrameGroup
 from pixmetry.locate.target_estimator import TargetEstimator, parse_estimator
 from pixmetry.observe.covered import BorderFrames, covered_pixels
@@ -71,7 +73,8 @@ def assess(
     Parameters
     ----------
     campaign : path, Campaign or None
-        A manifest, an EMVA 1288 descriptor, a folder with one of them, or None for the packaged example.
+        A manifest, an EMVA 1288 descriptor, a folder with one of them, or None for the packaged example. A folder of nothing but frames
+        is drafted as `pixmetry init` does, if names, tags and pixels tell all.
     output : path, optional
         Folder for ``report.html``, ``results.json``, ``maps.zarr.zip``, ``camera.yaml`` and ``camera.maps.npz``.
     target, estimator : str
@@ -108,7 +111,7 @@ def assess(
     """
     what_target = parse_target(target) if target else Target()
     what_estimator = parse_estimator(estimator) if estimator else TargetEstimator()
-    frames = campaign if isinstance(campaign, Campaign) else load_campaign(campaign)
+    frames = campaign if isinstance(campaign, Campaign) else _campaign_in(campaign, progress or no_progress)
     if output is not None:
         check_output(output, KIND, _origin(frames), _inputs(frames, calibration))  # before the work, not after it
     if isinstance(calibration, str | Path):
@@ -165,6 +168,15 @@ def assess(
         write_results(assessment, output, _inputs(frames, calibration))
         told("writing the report", 1, 1)
     return assessment
+
+
+def _campaign_in(path: str | Path | None, progress: Progress) -> Campaign:
+    """The campaign at a path; of a folder of nothing but frames the drafted one."""
+    try:
+        return load_campaign(path)
+    except NoCampaign:
+        assert path is not None  # the example is one
+        return draft_campaign(path, progress=progress).campaign()
 
 
 def crop_of(twin: Camera, budget: Budget, seed: int) -> Crop | None:

@@ -130,9 +130,10 @@ def _glob(base: Path, pattern: str, where: str) -> list[Path]:
                 f"pattern '{pattern}' cannot be used", where=where, allowed="a pattern relative to the folder of the manifest"
             ) from None
         if fitting:
-            return sorted(fitting, key=_natural)
+            return sorted(fitting, key=natural)
     return []
 
 
-def _natural(path: Path) -> list[tuple[int, str]]:
+def natural(path: Path) -> list[tuple[int, str]]:
+    """Key by which names sort as people count: frame 10 comes behind frame 9."""
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"([0-9]+)", path.as_posix())]

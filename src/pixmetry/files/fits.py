@@ -101,6 +101,11 @@ def planes(read: Read, size: int) -> list[Plane]:
     return found
 
 
+def header_of(read: Read, size: int) -> dict[str, object]:
+    """Keywords of the first header, by name; ValueError if it is damaged."""
+    return _header(read, 0, size)[0] or {}
+
+
 def _planes_of(header: dict[str, object], axes: list[int], bitpix: int, start: int) -> Iterator[Plane]:
     while len(axes) > 2 and axes[-1] == 1:
         axes = axes[:-1]

@@ -37,6 +37,10 @@ def photons_from_irradiance(irradiance_uw_per_cm2: float, exposure_s: float, are
     return energy_j * wavelength_nm * 1e-9 / (_PLANCK_J_S * _LIGHT_M_PER_S)
 
 
+class NoCampaign(InputError):
+    """A folder without manifest and descriptor; its frames may make a campaign all the same."""
+
+
 def load_campaign(path: str | Path | None = None) -> Campaign:
     """Load a campaign and check all that can be checked without reading every frame.
 
@@ -159,11 +163,11 @@ def _find_source(path: Path) -> Path:
             allowed="dark and bright frames of a uniform field, with their manifest",
             remedy="simulate a scene with photon_transfer (docs/scenes.md), which writes campaign.yaml too",
         )
+    allowed = "one manifest (*.yaml) or one EMVA 1288 descriptor (*.txt)"
+    if not found:
+        raise NoCampaign("folder holds no campaign", where=str(path), allowed=allowed, remedy=f"draft one with `pixmetry init {path}`")
     names = ", ".join(p.name for p in found)
-    what = f"folder holds several campaigns ({names})" if found else "folder holds no campaign"
-    raise InputError(
-        what, where=str(path), allowed="one manifest (*.yaml) or one EMVA 1288 descriptor (*.txt)", remedy="name the file itself"
-    )
+    raise InputError(f"folder holds several campaigns ({names})", where=str(path), allowed=allowed, remedy="name the file itself")
 
 
 def _read_manifest(source: Path) -> tuple[ManifestModel, Mapping[tuple[str | int, ...], int]]:
