@@ -69,6 +69,13 @@ KINDS = ("disc", "ellipse", "ring", "spot", "line", "edge", "cross", "chessboard
     show_default=True,
     help="Where light that falls off across a target acts: on the surface before the blur, or on the image after it.",
 )
+@click.option(
+    "--planes",
+    type=click.Choice(["never", "auto", "always"]),
+    default="auto",
+    show_default=True,
+    help="Whether templates have slopes of light and background. auto: where they also predict pixels that were held back.",
+)
 @click.option("--channel", type=click.Choice(["red", "green", "blue"]), help="Channel to use of colour images.")
 @click.option("--raw", metavar="WxH:FORMAT", help="Layout of files without a header, e.g. 1920x1200:Mono12p (GenICam's names).")
 @click.option("--threads", type=click.IntRange(1), help="Number of threads. Default: one for each processor.")
@@ -84,6 +91,7 @@ def locate(
     bits: int | None,
     aperture: float,
     light_on: str,
+    planes: str,
     channel: str | None,
     raw: str | None,
     threads: int | None,
@@ -124,6 +132,7 @@ def locate(
             bits=bits,
             aperture_px=aperture,
             light_on=light_on,
+            planes=planes,
             channel=channel,
             raw=raw,
             progress=progress,

@@ -16,6 +16,7 @@ from pixmetry.locate.noise import NoiseModel, noise_model
 from pixmetry.locate.records import Located
 
 WORK = {"line": locate_lines, "edge": locate_lines, "cross": locate_lines, "chessboard": locate_chessboard}  # of other kinds: spots
+PLANES: dict[str | bool, str | bool] = {"auto": "auto", "never": False, "always": True, False: False, True: True}
 
 
 def locate(
@@ -55,8 +56,9 @@ def locate(
         Side of the pixel's light-sensitive square, 0 for point samples.
     light_on : {"surface", "image"}
         Whether light that falls off across a target acts before the lens's blur or after it.
-    planes : {"auto"} or bool
-        Whether slopes of the light on a target and of the ground about it are unknowns of its template.
+    planes : {"auto", "never", "always"} or bool
+        Whether slopes of the light on a target and of the ground about it are unknowns of its template; "auto" takes them where they also
+        predict pixels that were held back. True is "always", False "never".
     threads : int, optional
     name : str
         Of the image, for the table.
@@ -94,10 +96,12 @@ def locate(
         what = f"the uncertainty of {estimator} is known only for pixels without gaps"
         remedy = "use the template, whose model includes the aperture"
         raise InputError(what, where="aperture_px", value=aperture_px, allowed="1", remedy=remedy)
+    if planes not in PLANES:
+        raise InputError("no such choice of planes", where="planes", value=planes, allowed="auto, never, always")
     image = checked_frame(frame, name)
     model = noise_model(noise)
     low, high = scale_ends(image, bits, model)
-    task = Task(image, kind, estimator, polarity, grid_size(grid, kind), model, low, high, aperture_px, light_on, threads, planes)
+    task = Task(image, kind, estimator, polarity, grid_size(grid, kind), model, low, high, aperture_px, light_on, threads, PLANES[planes])
     measured = Measured(*WORK.get(kind, locate_spots)(task))
     about = {"name": name, "rows": image.shape[0], "cols": image.shape[1], "targets": len(measured.columns["x_px"]), **measured.notes}
     if len(measured.left_out):

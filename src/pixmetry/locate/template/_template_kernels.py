@@ -46,6 +46,8 @@ LEAST_BACKGROUND = 0.01  # electrons, where their likelihood is used: there are 
 LEAST_ELECTRONS = 1e-3  # below it a pixel is as good as dark
 MOST_ELECTRONS = 60.0  # of a reading, from which it is as good as a shifted Poisson number
 PER_E = 8.0  # entries of the efficiency per unit of log(electrons)
+CORE = 0.96  # of the height, from which a pixel counts as inside the target
+LEAST_CORE = 5  # pixels there that tell a slope
 ROWS = 32  # of a target, at most, that are asked whether rows are shifted against each other
 ALIKE = math.exp(-1.0 / 5.0)  # correlation of the shifts of two lines of a field that follow each other, where a loop carries them on
 DOT = {"fastmath": {"reassoc", "contract", "nsz"}}
@@ -727,6 +729,87 @@ def residuals(
                     total += 1
         row_scores(window, used, system, scores[w], spread[w])
     return levels[:total], found[:total], steep[:total], scores, spread
+
+
+@jit
+def held_back(
+    frame: NDArray[np.generic], model: Model, parameters: Array, planes: tuple[bool, bool], which: Ints, about: About
+) -> tuple[Array, Array, Array]:
+    """Which planes parts of a target's pixels ask for, to be compared with the pixels that were held back; NaN where they tell nothing.
+
+    Returned are, for both halves of the window, the shift of the place that the planes bring, shape (2, n, 2), px, and their slopes, shape
+    (2, n, 4); and the slopes of grey values inside the target, shape (2, n, 2), DN per pixel: those that the pixels outside of its flat
+    core ask for, and those of the core. The halves are opposite quadrants, so that both reach to all sides and share no pixel. ``planes``:
+    whether those of the background and of the light are asked for. Fits without planes are at their end in ``parameters``.
+    """
+    kind, base = model.kind, SHAPES[model.kind] + 5
+    amplitude = base - 2
+    count = base + 2 * planes[0] + 2 * planes[1]
+    used = np.arange(count)
+    if not planes[0]:
+        used[base:] += 2
+    n = len(which)
+    moved, slopes, inside = np.full((2, n, 2), math.nan), np.full((2, n, 4), math.nan), np.full((2, n, 2), math.nan)
+    quality = np.empty((len(about.home), 10))
+    side = 2 * about.half[which].max() + 1
+    most = side * ((side + 7) // 8 * 8)
+    whole, part, step, reply = system_for(most), system_for(most), np.zeros(MOST), np.zeros(MOST)
+    normal, right = np.zeros((3, 3)), np.zeros(3)
+    for w in range(n):
+        i = which[w]
+        side = 2 * about.half[i] + 1
+        wide = (side + 7) // 8 * 8
+        data, mask = np.empty(side * wide, np.float32), np.empty(side * wide, np.float32)
+        cut_out(frame, about, model.noise, which[w : w + 1], Packed(np.zeros(1, np.int64), data, mask), quality)
+        p = parameters[i].copy()
+        p[0] -= int(round(about.home[i, 0])) - about.half[i]
+        p[1] -= int(round(about.home[i, 1])) - about.half[i]
+        images = mean_images(kind, p, side, side, model.aperture, model.surface)
+        weight, residual, kept = np.empty((side, wide)), np.empty((side, wide)), np.zeros((side, wide))
+        window = Window(images, data.reshape(side, wide), mask.reshape(side, wide), weight, kept, residual)
+        weigh(window, model.noise, np.empty(0), *mean_range(kind, p))
+        normal_equations(images, residual, weight, used, 0, whole)
+        if not factorise(whole.normal, base, RIDGE, whole.factor):
+            continue
+        for h in range(3):
+            for r in range(side):
+                for c in range(side):
+                    own = images[1 + amplitude, r, c] < CORE if h == 2 else ((r > p[1]) == (c > p[0])) == (h == 0)
+                    kept[r, c] = weight[r, c] if own else 0.0
+            normal_equations(images, residual, kept, used, 0, part)
+            if not solve(part.normal, count, part.gradient, RIDGE, part.factor, step):
+                continue
+            if h < 2:
+                for a in range(base):  # what the planes leave to the place, in the whole window
+                    reply[a] = dot(whole.normal[a, base:count], step[base:count])
+                substitute(whole.factor, base, reply, reply)
+                moved[h, w] = -reply[:2]
+                slopes[h, w] = 0.0
+                for a in range(base, count):
+                    slopes[h, w, used[a] - base] = step[a]
+                continue
+            normal[:], right[:], seen = 0.0, 0.0, 0
+            for r in range(side):
+                for c in range(side):
+                    if weight[r, c] == 0.0 or images[1 + amplitude, r, c] < CORE:
+                        continue
+                    rest = residual[r, c]
+                    for a in range(base):
+                        rest -= images[1 + a, r, c] * step[a]
+                    lever = (1.0, c - p[0], r - p[1])
+                    seen += 1
+                    for a in range(3):
+                        right[a] += weight[r, c] * lever[a] * rest
+                        for b in range(3):
+                            normal[a, b] += weight[r, c] * lever[a] * lever[b]
+            if seen >= LEAST_CORE and solve(normal, 3, right, RIDGE, part.factor, reply):
+                for k in range(2):
+                    inside[1, w, k] = reply[1 + k]
+                    inside[0, w, k] = 0.0
+                    for a in range(base, count):
+                        if used[a] == base + k or used[a] == base + 2 + k:
+                            inside[0, w, k] += step[a] * (1.0 if used[a] < base + 2 else p[amplitude])
+    return moved, slopes, inside
 
 
 @jit

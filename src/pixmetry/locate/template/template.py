@@ -7,6 +7,7 @@ from functools import partial
 import numpy as np
 
 from pixmetry.core.errors import InputError
+from pixmetry.core.threads import map_tiles
 from pixmetry.locate.detect.targets import Flag, Positions, Targets
 from pixmetry.locate.estimator import Method, Settings
 from pixmetry.locate.noise import NoiseModel
@@ -30,7 +31,9 @@ DROP_FALL = 5.99  # fall by 2 unknowns that chance exceeds once in 20
 MEDIAN_FALL = {2: (1.386, 2.0), 4: (3.357, 3.19)}  # median of χ² with 2 or 4 degrees, and its standard deviation times √n
 POOL = 20  # targets from which their falls are also looked at together
 POOLED_SIGMA = 5.0
-MEDIAN_WORTH = 3.0  # of a noncentral χ² with 2 degrees and a noncentrality of 2
+NEIGHBOURS = 8  # targets around one that must agree with it on a plane
+PIECES = 8  # of the work
+FAR_OUT = 25.0  # times the usual
 POOR_SIGMA = 5.5
 FAINT_SHARE = 0.15  # of the blur: uncertainty from which the covariance of first order is too small
 SHARP_PX = 0.3  # blur below which a template's position begins to depend on the exact shape of the pixel
@@ -128,11 +131,11 @@ def fit_template(
 
     Notes
     -----
-    "auto" takes a plane in by the fall of χ² that it would bring: for a single target where chance brings it once in 1000; for all of them
-    where the median fall of at least 20 targets stands 5 standard deviations above that of chance (3e-7). Falls are divided by the median
-    χ² per degree of freedom where that exceeds 1. Planes of many targets stay only if they take more bias from the places than they add
-    noise (`worth_it`), and if the ground around the targets has them too (`believable`). A slope too
-    small to be seen, which shifts the position by up to about two standard uncertainties, is not in the covariance of a single target.
+    "auto" looks for planes by the fall of χ² that they would bring: for a single target where chance brings it once in 1000; for all
+    of them where the median fall of at least 20 targets stands 5 standard deviations above that of chance (3e-7). Falls are divided by the
+    median χ² per degree of freedom where that exceeds 1. Planes are fitted only where they also predict pixels that were held back
+    (`predicted`). A slope too small to be seen, which shifts the position by up to about two standard uncertainties, is not in the
+    covariance of a single target.
 
     References
     ----------
@@ -164,14 +167,14 @@ def fit_template(
             again = np.flatnonzero((on_ground == ground) & (on_light == light))
             if not len(again):
                 continue
+            free = ground and background_plane == "auto", light and light_plane == "auto"  # the other one is wanted in any case
+            if any(free):
+                there, other = predicted(windows, targets, result, again, (ground, light), threads)
+                on_ground[again[~there]], on_light[again[~there]] = other[0] or ground and not free[0], other[1] or light and not free[1]
+                again = again[there]
+            if not len(again):
+                continue
             sloped = run_fit(windows, again, start, ground, light, False, threads)
-            if len(again) >= POOL:
-                real_ground, real_light = believable(targets, windows.noise, sloped, again)
-                if not worth_it(result, sloped, again):
-                    real_ground = real_light = False
-                on_ground[again], on_light[again] = ground and real_ground, light and real_light
-                if (ground and not real_ground) or (light and not real_light):
-                    continue
             result = result.put(again, sloped)
     return _positions(kind, targets, result, on_ground, on_light)
 
@@ -204,41 +207,65 @@ def choose_planes(
     return on_ground, on_light
 
 
-def believable(targets: Targets, noise: NoiseModel, sloped: Fitted, which: np.ndarray) -> tuple[bool, bool]:
-    """Whether the slopes that many fits found are those of the ground around the targets, as the map of the background has it.
+def predicted(
+    windows: Windows, targets: Targets, plain: Fitted, which: np.ndarray, planes: tuple[bool, bool], threads: int | None
+) -> tuple[np.ndarray, tuple[bool, bool]]:
+    """Whether planes that some pixels of a target ask for are also those of pixels that were held back; shape (n,), bool.
 
-    A background that slopes under targets does so between them. Light that falls off over dark targets falls off over their bright ground,
-    in the same proportion. A halo that a lens, a coder or a sharpening filter puts on one side of every target does neither.
+    Where not, the second answer says which plane of two remains to be tried.
+
+    The planes of either half of the pixels move the place by a and b. The mean of a·b is the square of the bias that they take away,
+    whatever the noise is; that of |a − b|²/4 is the noise that they add. Planes are fitted where the former is larger: noise that is
+    correlated over pixels brings a fall of χ², but no shift on which the halves agree. Many targets are judged together. Their planes must
+    then be light, not a halo that a lens, a coder or a filter puts on one side of every target: neighbours in the frame have the same,
+    the background's map has its slopes, and the flat inside of the targets slopes as their edges say.
     """
-    good = which[sloped.at_rest[which]]
-    if len(good) < POOL:
-        return True, True
-    there = np.stack([targets.background_x_dn_per_px[good], targets.background_y_dn_per_px[good]], axis=1)
-    bright = np.maximum(targets.background_dn[good] - max(noise.black_dn, 0.0), 0.0)[:, None]
-    ground, light = sloped.parameters[good, -4:-2], sloped.parameters[good, -2:] * bright
-    u = np.sqrt(np.nan_to_num(sloped.variance[good, -4:]))
-    dark = np.median(bright[:, 0] + targets.amplitude_dn[good]) < 0.5 * np.median(bright)  # the ground is what has the light
+    from scipy.spatial import cKDTree
 
-    def agrees(slope: np.ndarray, uncertainty: np.ndarray) -> bool:
-        return bool(np.median(np.abs(slope - there)) < 0.5 * np.median(np.abs(slope)) + np.median(uncertainty))
+    from pixmetry.locate.template._template_kernels import held_back
 
-    return agrees(ground, u[:, :2]), not dark or agrees(light, u[:, 2:] * bright)
+    model = windows.model
+
+    def piece(part: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return held_back(windows.frame, model, plain.parameters, planes, part, windows.about)
+
+    pieces = map_tiles(piece, np.array_split(which, min(PIECES, len(which))), threads)
+    moved, slopes, inside = (np.concatenate(v, axis=1) for v in zip(*pieces, strict=True))
+    both, apart = (moved[0] * moved[1]).sum(axis=1), ((moved[0] - moved[1]) ** 2).sum(axis=1) / 4
+    alone: np.ndarray = both > apart  # False where a half tells nothing
+    good = np.isfinite(both)
+    none = (False, False)
+    if good.sum() < POOL:
+        return alone, none
+    usual_fall = max(1.0, float(np.median(plain.falls[which, 2])) / MEDIAN_FALL[4][0])
+    alone &= plain.falls[which, 2] > RATE_FALL[4] * usual_fall  # what stands out from the falls that all have
+    good &= both + apart < FAR_OUT * np.median((both + apart)[good])  # a dot under dirt has no voice
+    light_only = (False, planes[0] and planes[1])
+    if both[good].mean() < apart[good].mean():
+        return alone, light_only
+    shift = 0.5 * (moved[0] + moved[1])[good]
+    place = plain.parameters[which[good], :2]
+    usual = np.median(shift[cKDTree(place).query(place, NEIGHBOURS + 1)[1][:, 1:]], axis=1)
+    if (shift * usual).sum() < ((shift - usual) ** 2).sum():
+        return alone, light_only
+    part, chosen = targets[which[good]], slopes[:, good]
+    there = np.stack([part.background_x_dn_per_px, part.background_y_dn_per_px], axis=1)
+    bright = np.maximum(part.background_dn - max(windows.noise.black_dn, 0.0), 0.0)[:, None]
+    dark = np.median(bright[:, 0] + part.amplitude_dn) < 0.5 * np.median(bright)  # the ground is what has the light
+    if planes[0] and not _explains(there, chosen[:, :, :2]):
+        return alone, light_only
+    if planes[1]:
+        on_core = _explains(inside[1, good], np.stack([inside[0, good]] * 2))
+        if not on_core or (dark and not _explains(there, chosen[:, :, 2:] * bright)):
+            return alone, (planes[0], False)
+    return np.ones(len(which), bool), none
 
 
-def worth_it(plain: Fitted, sloped: Fitted, which: np.ndarray) -> bool:
-    """Whether planes take more bias from the places of many targets than they add noise to them.
-
-    With Δ the shift of a place and V the rise of its covariance that the planes bring, Δᵀ V⁻¹ Δ is 2 on average where there was no bias,
-    and 4 where bias² is as large as the added variance. Grey values that are not as the template has them (coders, sharpening) bring a
-    fall of χ² by planes that move nothing but the noise.
-    """
-    dx, dy = (sloped.parameters[which, k] - plain.parameters[which, k] for k in (0, 1))
-    xx, xy, yy = (np.where(sloped.at_rest[which], (sloped.covariance - plain.covariance)[which, k], np.nan) for k in range(3))
-    size = xx * yy - xy * xy
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = (yy * dx * dx - 2 * xy * dx * dy + xx * dy * dy) / size
-    ratio = ratio[np.isfinite(ratio) & (size > 0) & (xx > 0)]
-    return bool(len(ratio)) and float(np.median(ratio)) > MEDIAN_WORTH
+def _explains(there: np.ndarray, slopes: np.ndarray) -> bool:
+    """Whether slopes that are known from elsewhere, shape (n, 2), are at least half of those of two halves of the pixels, (2, n, 2)."""
+    told = np.isfinite(there).all(axis=1) & np.isfinite(slopes).all(axis=(0, 2))
+    mean = 0.5 * (slopes[0] + slopes[1])
+    return bool((there * mean)[told].sum() > 0.5 * (slopes[0] * slopes[1])[told].sum())
 
 
 def _significant(fall: np.ndarray, good: np.ndarray, degrees: int) -> np.ndarray:
