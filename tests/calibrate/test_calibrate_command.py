@@ -474,7 +474,7 @@ def test_colour_images_of_a_project_are_told_which_key_is_meant(tmp_path: Path, 
 
 def test_the_projects_of_the_page_are_valid(tmp_path: Path) -> None:
     blocks = re.findall(r"^```yaml\n(.*?)^```", DOCS.read_text(), re.M | re.S)
-    assert len(blocks) == 4
+    assert len(blocks) == 5
     for text in blocks:
         (tmp_path / "p.yaml").write_text(text)
         data = load_yaml(tmp_path / "p.yaml")

@@ -75,7 +75,7 @@ def calibrate(
         targets), ``side_mm``, ``diameter_mm`` (of squares and dots), ``polarity``, ``channel``, ``raw`` ("1920x1200:Mono12p", of files
         without a header), ``noise``; and of the camera: ``camera`` (a preset or camera file, which brings the pitch), ``interface``
         ("digital" or "analogue": whether a frame grabber samples its lines), ``direction``, ``pixel_um`` (pitch of the pixels), ``c_mm``
-        or ``c_px``.
+        or ``c_px``; ``rig=True``: the names tell several cameras that stand still against each other, and their instants (left01, right01).
 
     Returns
     -------
@@ -243,14 +243,14 @@ def _project(source: str | Path | Sequence[str | Path], pictures: Mapping[str, A
     if projects:
         _refuse_pictures(pictures, "a project file, which states it itself")
         return load_project(projects[0], progress)
-    keys = (*PICTURE_KEYS, *CAMERA_KEYS)
+    keys = (*PICTURE_KEYS, *CAMERA_KEYS, "rig")
     unknown = next((name for name in pictures if name not in keys), None)
     if unknown is not None:
         raise InputError(f"unknown option '{unknown}'", allowed=", ".join(keys), remedy="delete it")
     given = {name: value for name, value in pictures.items() if value is not None}
     camera = {key: given[name] for name, key in CAMERA_KEYS.items() if name in given}
     plate = {key: given[name] for name, key in PICTURE_KEYS.items() if name in given}
-    return project_of_pictures(sources, camera, plate, progress)
+    return project_of_pictures(sources, camera, plate, progress, rig=bool(given.get("rig")))
 
 
 def _sources(source: str | Path | Network | Sequence[str | Path]) -> list[str | Path]:
@@ -262,7 +262,7 @@ def _sources(source: str | Path | Network | Sequence[str | Path]) -> list[str | 
 
 
 def _refuse_pictures(pictures: Mapping[str, Any], what: str) -> None:
-    given = [name for name, value in pictures.items() if value is not None]
+    given = [name for name, value in pictures.items() if value not in (None, False)]
     if given:
         raise InputError(f"has no meaning with {what}", where=given[0], allowed="with pictures of a test field", remedy="leave it out")
 

@@ -1173,6 +1173,114 @@ class CheckRecord:
 
 
 @dataclass(frozen=True)
+class RigCamera:
+    """A camera of a rig against its reference, with standard uncertainties.
+
+    Parameters
+    ----------
+    camera, reference : str
+    rotation : ndarray, shape (3, 3)
+        Takes directions of the reference's frame to that of the camera.
+    rotation_deg, u_rotation_deg : ndarray, shape (3,)
+        Its rotation vector; uncertainties of small rotations about the axes of the camera.
+    position, u_position : ndarray, shape (3,)
+        Projection centre in the frame of the reference, in the unit of the object.
+    baseline, u_baseline, angle_deg, u_angle_deg : float
+        Lengths of the two.
+    """
+
+    camera: str
+    reference: str
+    rotation: np.ndarray
+    rotation_deg: np.ndarray
+    u_rotation_deg: np.ndarray
+    position: np.ndarray
+    u_position: np.ndarray
+    baseline: float
+    u_baseline: float
+    angle_deg: float
+    u_angle_deg: float
+
+
+@dataclass(frozen=True)
+class EpipolarRecord:
+    """Distances of image points from epipolar lines, in images without distortion.
+
+    Parameters
+    ----------
+    first, second : str
+        Cameras.
+    n : int
+        Points seen by both at one instant.
+    rms_px, u_rms_px : float
+    expected_px : float
+        By the noise of the image coordinates alone.
+    """
+
+    first: str
+    second: str
+    n: int
+    rms_px: float
+    u_rms_px: float
+    expected_px: float
+
+
+@dataclass(frozen=True)
+class RigidTest:
+    """F-test whether the cameras of a rig stood still against each other.
+
+    Parameters
+    ----------
+    f : float
+    dof : (int, int)
+    p : float
+    scatter, expected, scatter_deg, expected_deg : float
+        rms of the differences of the relative poses, instant by instant, from those of the rig, and what noise explains of it.
+    worst : str
+        Image whose relative pose differs most, by its uncertainty.
+    """
+
+    f: float
+    dof: tuple[int, int]
+    p: float
+    scatter: float
+    expected: float
+    scatter_deg: float
+    expected_deg: float
+    worst: str
+
+
+@dataclass(frozen=True)
+class RigRecord:
+    """Cameras that stand still against each other.
+
+    Parameters
+    ----------
+    instants : int
+        With images of two cameras or more.
+    unit : str
+    cameras : tuple of RigCamera
+    covariance : ndarray, shape (6 n, 6 n)
+        Camera by camera: small rotations about its axes, rad, then its position.
+    widened : float
+        Factor on all uncertainties, because instants scatter by more than noise.
+    epipolar : tuple of EpipolarRecord
+    rigid : RigidTest or None
+    unjoined : tuple of str
+        Cameras that share no instant with the others.
+    """
+
+    instants: int
+    unit: str
+    cameras: tuple[RigCamera, ...]
+    covariance: np.ndarray
+    epipolar: tuple[EpipolarRecord, ...] = ()
+    rigid: RigidTest | None = None
+    widened: float = 1.0
+    unjoined: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
 class LineRecord:
     """A straight line.
 
@@ -1242,6 +1350,7 @@ class Tests:
     known : KnownRecord
     eccentricity : EccentricityRecord
     check_points : CheckRecord
+    rig : RigRecord
     """
 
     __test__ = False  # no class of tests for pytest
@@ -1267,6 +1376,7 @@ class Tests:
     eccentricity: EccentricityRecord | None = _if_made()
     residual_grid: Mapping[str, ResidualGrid] | None = _if_made()
     check_points: CheckRecord | None = _if_made()
+    rig: RigRecord | None = _if_made()
 
     @property
     def made(self) -> bool:

@@ -46,6 +46,12 @@ OPTIONS = ("field", "loss", "folds", "residual_grid", "snoop", "a_priori")
 @click.option("--channel", type=click.Choice(["red", "green", "blue"]), help="Channel to use of colour images.")
 @click.option("--raw", metavar="WxH:FORMAT", help="Layout of files without a header, e.g. 1920x1200:Mono12p (GenICam's names).")
 @click.option(
+    "--rig",
+    is_flag=True,
+    help="The images are of several cameras that stand still against each other: in left01, right01 the number is the instant, the rest "
+    "the camera; so with folders cam0/01, cam1/01.",
+)
+@click.option(
     "--noise", metavar="CAMERA|KEY=NUMBER,…", help="Noise of the images, as in `pixmetry locate`. Default: estimated from each image."
 )
 @click.option(

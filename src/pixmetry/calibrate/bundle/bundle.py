@@ -19,6 +19,7 @@ from pixmetry.calibrate.bundle.bundle_layout import Layout, layout_of, without
 from pixmetry.calibrate.bundle.bundle_system import LOSSES, Linearised, Loss, Solved, bent, cost, equations, linearise, point_roots, solve
 from pixmetry.calibrate.bundle.datum import Datum, aligned, datum_of, nearest_to_control
 from pixmetry.calibrate.bundle.network import Adjustment, Network, State
+from pixmetry.calibrate.bundle.rig import Ties, rigid
 from pixmetry.core.arrays import Array, Flags
 from pixmetry.core.errors import InputError
 from pixmetry.core.threads import single_threaded_blas
@@ -106,14 +107,16 @@ def adjust(
 
 
 def _in_order(layout: Layout, start: State) -> State:
-    """Fixed coordinates are those of the network; per-image parameters have mean zero over a camera's images."""
+    """Fixed coordinates are those of the network; cameras of a rig stand still against each other; per-image parameters have mean zero over
+    a camera's images."""
     x_scale, x_shift = start.x_scale.copy(), start.x_shift_px.copy()
     for place, values in zip(layout.extra, (x_scale, x_shift), strict=True):
         for k in range(len(layout.free)) if place >= 0 else ():
             of_camera = (layout.image_col >= 0) & (layout.camera_of == k)
             values[of_camera] -= values[of_camera].sum() / max(1, of_camera.sum())
     xyz = np.where(layout.held & np.isfinite(start.xyz), layout.network.xyz, start.xyz)
-    return replace(start, x_scale=x_scale, x_shift_px=x_shift, xyz=xyz)
+    start = replace(start, x_scale=x_scale, x_shift_px=x_shift, xyz=xyz)
+    return start if layout.rig is None else rigid(layout.rig, start)
 
 
 def _moved(layout: Layout, state: State, solved: Solved) -> State:
@@ -130,10 +133,26 @@ def _moved(layout: Layout, state: State, solved: Solved) -> State:
     turn, shift = solved.step[at[:, None] + np.arange(3)], solved.step[at[:, None] + np.arange(3, 6)]
     position[there] += _along_arc(rotation[there], turn, shift)
     rotation[there] = _turns(turn) @ rotation[there]
+    if solved.ties is not None:
+        rotation, position = _rig_moved(solved.ties, solved.step, rotation, position)
     for place, values in zip(layout.extra, (x_scale, x_shift), strict=True):
         if place >= 0:
             values[there] += solved.step[at + place]
     return State(interior, rotation, position, x_scale, x_shift, xyz)
+
+
+def _rig_moved(ties: Ties, step: Array, rotation: Array, position: Array) -> tuple[Array, Array]:
+    """Poses of all images after a step whose images of a rig stay together."""
+    rig, before, inner = ties.rig, ties.frames, ties.inner(step)
+    turn, shift = (inner[ties.base[:, None] + np.arange(first, first + 3)] for first in (0, 3))
+    R, d, some = before.rotation.copy(), before.place.copy(), np.flatnonzero(ties.rel >= 0)
+    R[some] = _turns(inner[ties.rel[some][:, None] + np.arange(3)]) @ R[some]
+    d[some] += inner[ties.rel[some][:, None] + np.arange(3, 6)]
+    at = before.base_position + _along_arc(before.base_rotation, turn, shift)
+    base, t, k = _turns(turn) @ before.base_rotation, rig.instant, rig.camera
+    rotation[rig.image] = R[k] @ base[t]
+    position[rig.image] = at[t] + np.einsum("nji,nj->ni", base[t], d[k])
+    return rotation, position
 
 
 def _along_arc(rotation: Array, turn: Array, shift: Array) -> Array:
@@ -232,9 +251,10 @@ def _fall(layout: Layout, now: Linearised, after: Linearised) -> float:
 
 def _dof(layout: Layout, datum: Datum) -> int:
     """Observations and constraints less unknowns."""
+    dependent = 0 if layout.rig is None else 6 * len(layout.rig.image) - layout.rig.unknowns
     known = int(((layout.prior > 0) & layout.determined[:, None]).sum())
     unknown = int((~layout.held & layout.determined[:, None]).sum())
-    free = int(layout.camera_count.sum()) + int((layout.image_col >= 0).sum()) * layout.per_image
+    free = int(layout.camera_count.sum()) + int((layout.image_col >= 0).sum()) * layout.per_image - dependent
     return 2 * int(layout.used.sum()) + len(layout.bars) + known + len(layout.constraints) + datum.missing - free - unknown
 
 

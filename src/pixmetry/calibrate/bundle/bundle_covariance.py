@@ -12,14 +12,16 @@ from typing import NoReturn
 import numpy as np
 
 from pixmetry.calibrate.bundle import _bundle_kernels as kernels
-from pixmetry.calibrate.bundle.bundle_layout import Layout
+from pixmetry.calibrate.bundle.bundle_layout import POSE, Layout
 from pixmetry.calibrate.bundle.bundle_system import (
     BLOCK_POINTS,
     Linearised,
     Solved,
     condensed,
+    constraints_of,
     dense,
     equations,
+    free_motions,
     point_roots,
     reduce,
     regularise,
@@ -28,6 +30,7 @@ from pixmetry.calibrate.bundle.bundle_system import (
 from pixmetry.calibrate.bundle.datum import Datum, carried, null_space
 from pixmetry.calibrate.bundle.model import NAMES
 from pixmetry.calibrate.bundle.network import PER_IMAGE_NAMES, Network, State
+from pixmetry.calibrate.bundle.rig import rig_of
 from pixmetry.core.arrays import Array
 from pixmetry.core.errors import MeasureError
 
@@ -140,22 +143,23 @@ def _inverse(layout: Layout, datum: Datum, now: Linearised, solved: Solved) -> A
     from scipy.linalg.lapack import dpotri
 
     lower: Array = dpotri(solved.factor, lower=0, overwrite_c=1)[0].T
-    if not np.diagonal(lower).max() < SINGULAR and not _weakly_placed(layout, datum, now, lower, solved.scale):
+    if not np.diagonal(lower).max() < SINGULAR and not _weakly_placed(layout, datum, now, lower, solved):
         raise_weak(layout, datum, now, "the unknowns are not determined")
     kernels.scaled_whole(lower, solved.scale)
     if len(layout.constraints):
-        C = layout.constraints
+        C = constraints_of(layout, solved.ties)
         away = lower @ C.T
         lower -= away @ np.linalg.solve(C @ away, away.T)
-    return lower
+    return lower if solved.ties is None else solved.ties.whole(lower)
 
 
-def _weakly_placed(layout: Layout, datum: Datum, now: Linearised, lower: np.ndarray, scale: np.ndarray) -> bool:
+def _weakly_placed(layout: Layout, datum: Datum, now: Linearised, lower: np.ndarray, solved: Solved) -> bool:
     """Whether a network is determined but for its place, which weak control gives: variance inflation without the seven of the datum."""
     if (layout.held & layout.determined[:, None]).any() or not np.diagonal(lower).max() < ROUNDED:
         return False
     whole = np.tril(lower) + np.tril(lower, -1).T
-    H = np.linalg.qr(null_space(layout, now.state, replace(datum, missing=7))[0] / scale[:, None])[0]
+    motions = free_motions(layout, now.state, replace(datum, missing=7), solved.ties)
+    H = np.linalg.qr(motions / solved.scale[:, None])[0]
     away = H @ (H.T @ whole)
     inflation = np.diagonal(whole) - 2 * np.diagonal(away) + np.sum((away @ H) * H, axis=1)
     return bool(inflation.max() < SINGULAR)
@@ -211,13 +215,17 @@ def raise_weak(layout: Layout, datum: Datum, now: Linearised, what: str) -> NoRe
     whole = np.diagonal(S).copy()
     root, _ = point_roots(layout, V)
     reduce(layout, condensed(layout, now, root), h, root, S, g)
+    ties = layout.ties(now.state)
+    if ties is not None:
+        S, whole = ties.reduced(S), np.asarray((ties.T.power(2)).T @ whole)
     diagonal = np.diagonal(S)
     scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, np.maximum(whole, 1e-300)))
-    regularise(layout, datum, now.state, S, scale)
+    regularise(layout, datum, now.state, S, scale, ties)
     lower = np.tril(S)
     whole = lower + np.tril(lower, -1).T
     values, vectors = np.linalg.eigh(np.where(np.isfinite(whole), whole, 0.0))
     covariance = (vectors / (np.maximum(values, 0.0) + RIDGE)) @ vectors.T * np.outer(scale, scale)
+    covariance = covariance if ties is None else ties.whole(covariance)
     weak = weak_direction(layout.free_columns, _of_estimated(layout, covariance), layout.network, now.state)
     remedy = "add images that are tilted and rolled against each other, hold one of these parameters fixed, or give control points"
     free = int(layout.camera_count.sum())
@@ -247,7 +255,7 @@ def weak_direction(columns: tuple[str, ...], covariance: np.ndarray, network: Ne
     """
     from scipy.sparse.linalg import eigsh
 
-    names, covariance = _along_axes(columns, covariance, network, state)
+    names, covariance = _along_axes(*_independent(columns, covariance, network, state), network, state)
     u = np.sqrt(np.maximum(np.diagonal(covariance), 1e-300))
     correlation = covariance / np.outer(u, u)
     direction = eigsh(correlation, k=1, which="LA", v0=np.ones(len(u)))[1][:, 0] if len(u) > 2 else np.ones(len(u))
@@ -257,6 +265,17 @@ def weak_direction(columns: tuple[str, ...], covariance: np.ndarray, network: Ne
         return own
     assert common is not None  # there are two parameters, or nothing could be weak
     return common
+
+
+def _independent(columns: tuple[str, ...], covariance: np.ndarray, network: Network, state: State) -> tuple[tuple[str, ...], np.ndarray]:
+    """Without images whose poses follow from those of other images of their rig."""
+    rig = rig_of(network, state.posed)
+    if rig is None:
+        return columns, covariance
+    leading = {int(rig.image[row]) for row, _ in rig.tree}
+    lost = {f"{network.images[i]}:{name}" for i in rig.image if int(i) not in leading for name in POSE}
+    keep = [i for i, name in enumerate(columns) if name not in lost]
+    return tuple(columns[i] for i in keep), covariance[np.ix_(keep, keep)]
 
 
 def _worst_pair(groups: dict[str, list[int]], covariance: np.ndarray) -> WeakDirection | None:

@@ -11,6 +11,7 @@ import numpy as np
 from pixmetry.calibrate.bundle._bundle_kernels import ELIMINATED, HELD, Incidence
 from pixmetry.calibrate.bundle.model import CODES, NAMES
 from pixmetry.calibrate.bundle.network import PER_IMAGE_NAMES, Network, ScaleBars, State
+from pixmetry.calibrate.bundle.rig import Rig, Ties, rig_of
 from pixmetry.core.arrays import Array, Flags, Ints
 from pixmetry.core.errors import InputError, MeasureError
 
@@ -52,6 +53,8 @@ class Layout:
         Rows of unit length whose product with the reduced unknowns stays 0.
     direction, per_px : ndarray, shape (cameras,), (cameras, 2)
         Of the distortion; length units per pixel.
+    rig : Rig, optional
+        Images whose poses depend on each other.
     notes : tuple of str
     """
 
@@ -78,6 +81,7 @@ class Layout:
     constraints: Array
     direction: Ints
     per_px: Array
+    rig: Rig | None = None
     notes: tuple[str, ...] = ()
 
     @property
@@ -114,6 +118,10 @@ class Layout:
         free = np.ascontiguousarray(self.free[:, : int(self.camera_count.max())])
         columns = (self.camera_col, self.camera_count, self.image_col, self.point_col)
         return Incidence(self.image, self.point, self.first, self.camera_of, free, self.extra, *columns)
+
+    def ties(self, state: State) -> Ties | None:
+        """How the unknowns of a rig's images depend on those of the rig, at a state; None without a rig."""
+        return None if self.rig is None else Ties(self.rig, state, self.image_col, len(self.columns))
 
     @property
     def per_image(self) -> int:
@@ -185,6 +193,7 @@ def layout_of(network: Network, start: State, used: np.ndarray | None) -> Layout
         constraints=np.array([np.pad(row, (0, len(columns) - len(row))) for row in constraints]).reshape(-1, len(columns)),
         direction=np.array([CODES[camera.direction] for camera in network.cameras], np.int64),
         per_px=np.array([camera.sensor.per_px for camera in network.cameras], float),
+        rig=rig_of(network, image_there),
         notes=_lost_bars(network, point_there),
     )
 

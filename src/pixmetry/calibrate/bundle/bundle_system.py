@@ -12,6 +12,7 @@ from pixmetry.calibrate.bundle._model_kernels import Cameras, Views
 from pixmetry.calibrate.bundle.bundle_layout import Layout
 from pixmetry.calibrate.bundle.datum import Datum, null_space
 from pixmetry.calibrate.bundle.network import State
+from pixmetry.calibrate.bundle.rig import Ties
 from pixmetry.core.arrays import Array, Flags
 
 LOSSES = ("none", "huber", "cauchy")
@@ -58,6 +59,8 @@ class Solved:
     scale: Array
     root: Array
     Z: Eliminated
+    inner: Array  # the step in the unknowns of the factor: those of a rig where there is one
+    ties: Ties | None = None
 
 
 def linearise(layout: Layout, state: State, loss: Loss) -> Linearised:
@@ -189,16 +192,19 @@ def solve(layout: Layout, datum: Datum, now: Linearised, damping: float, work: n
     root, _ = point_roots(layout, V)
     Z = condensed(layout, now, root)
     reduce(layout, Z, h, root, work, right)
+    ties = layout.ties(now.state)
+    if ties is not None:
+        work, right = ties.reduced(work), ties.T.T @ right
     diagonal = np.diagonal(work)
     if not ((diagonal > 0) & np.isfinite(diagonal)).all():
         return None
     scale = 1 / np.sqrt(diagonal)
-    regularise(layout, datum, now.state, work, scale)
+    regularise(layout, datum, now.state, work, scale, ties)
     factor, info = dpotrf(work.T, lower=0, overwrite_a=1, clean=0)
     if info:
         return None
-    step, points = _answer(layout, now, factor, scale, root, right, h)
-    return Solved(step, points, float(g @ step + (h * points).sum()), factor, scale, root, Z)
+    inner, step, points = _answer(layout, now, factor, scale, root, right, h, ties)
+    return Solved(step, points, float(g @ step + (h * points).sum()), factor, scale, root, Z, inner, ties)
 
 
 def bent(layout: Layout, now: Linearised, solved: Solved, second: np.ndarray) -> Solved:
@@ -209,40 +215,60 @@ def bent(layout: Layout, now: Linearised, solved: Solved, second: np.ndarray) ->
     g, h = np.zeros(len(solved.step)), np.zeros_like(solved.points)
     kernels.gradients(second, now.linear, layout.incidence, g, h)
     _reduce_right(layout, solved.Z, h, solved.root, g)
-    step, points = _answer(layout, now, solved.factor, solved.scale, solved.root, g, h)
-    length, along = np.linalg.norm(step / solved.scale) / 2, np.linalg.norm(solved.step / solved.scale)
+    right = g if solved.ties is None else solved.ties.T.T @ g
+    inner, step, points = _answer(layout, now, solved.factor, solved.scale, solved.root, right, h, solved.ties)
+    length, along = np.linalg.norm(inner / solved.scale) / 2, np.linalg.norm(solved.inner / solved.scale)
     share = 0.5 if length < MOST_BENT * along else 0.0
-    return replace(solved, step=solved.step + share * step, points=solved.points + share * points)
+    return replace(solved, step=solved.step + share * step, points=solved.points + share * points, inner=solved.inner + share * inner)
 
 
 def _answer(
-    layout: Layout, now: Linearised, factor: np.ndarray, scale: np.ndarray, root: np.ndarray, right: np.ndarray, h: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Reduced unknowns and points for a right side whose points are eliminated."""
+    layout: Layout,
+    now: Linearised,
+    factor: np.ndarray,
+    scale: np.ndarray,
+    root: np.ndarray,
+    right: np.ndarray,
+    h: np.ndarray,
+    ties: Ties | None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Unknowns of the factor, reduced unknowns and points for a right side whose points are eliminated."""
     from scipy.linalg.lapack import dpotrs
 
     step = dpotrs(factor, right * scale, lower=0)[0]
     if len(layout.constraints):
-        C = layout.constraints * scale
+        C = constraints_of(layout, ties) * scale
         away = dpotrs(factor, C.T, lower=0)[0]
         step -= away @ np.linalg.solve(C @ away, C @ step)
     step *= scale
+    inner, step = step, step if ties is None else ties.expanded(step)
     points = np.zeros((*h.shape, 1))
     kernels.point_steps(now.linear, layout.incidence, root, h[:, :, None], step[:, None], points)
     points = points[:, :, 0]
     points[layout.held] = 0.0
-    return step, points
+    return inner, step, points
 
 
-def regularise(layout: Layout, datum: Datum, state: State, S: np.ndarray, scale: np.ndarray) -> None:
+def constraints_of(layout: Layout, ties: Ties | None) -> np.ndarray:
+    """Rows whose product with the unknowns of the factor stays 0."""
+    return layout.constraints if ties is None else np.asarray(layout.constraints @ ties.T)
+
+
+def regularise(layout: Layout, datum: Datum, state: State, S: np.ndarray, scale: np.ndarray, ties: Ties | None) -> None:
     """Give the lower triangle a unit diagonal, and add to it what datum and constraints leave out."""
     from scipy.linalg.blas import dsyrk
 
     kernels.scaled_lower(S, scale)
-    more = [np.linalg.qr(null_space(layout, state, datum)[0] / scale[:, None])[0]] if datum.missing else []
+    more = [np.linalg.qr(free_motions(layout, state, datum, ties) / scale[:, None])[0]] if datum.missing else []
     if len(layout.constraints):
-        rows = layout.constraints * scale
+        rows = constraints_of(layout, ties) * scale
         more.append((rows / np.linalg.norm(rows, axis=1, keepdims=True)).T)
     if more:
         H = np.asfortranarray(np.concatenate(more, axis=1))
         dsyrk(1.0, H, beta=1.0, c=S.T, lower=0, overwrite_c=1)
+
+
+def free_motions(layout: Layout, state: State, datum: Datum, ties: Ties | None) -> np.ndarray:
+    """Motions of the unknowns of the factor that change no observation, shape (m, d)."""
+    motions = null_space(layout, state, datum)[0]
+    return motions if ties is None else ties.inner(motions)

@@ -100,6 +100,9 @@ class Network:
         Whether ``covariance_px2`` came with the data, or is a guess (then only its ratios count).
     poses : Poses, optional
         Start values, where there are any; otherwise they are found.
+    instant : ndarray of int, shape (images,), optional
+        Images of one instant have one number: their cameras stand still against each other, as a rig (`pixmetry.calibrate.bundle.rig`).
+        -1: of no instant.
     """
 
     cameras: tuple[CameraModel, ...]
@@ -122,6 +125,7 @@ class Network:
     unit: str = "mm"
     covariance_known: bool = False
     poses: Poses | None = None
+    instant: Ints | None = None
 
     def __len__(self) -> int:
         return len(self.x_px)

@@ -234,8 +234,10 @@ def _findings(settled: Settled, tests: Tests) -> list[Finding]:
     from pixmetry.calibrate.checks.checks import check_determined
     from pixmetry.calibrate.checks.findings import eccentricity_findings, findings_of, hold_out_findings, in_the_shadow
     from pixmetry.calibrate.checks.patterns import pattern_findings
+    from pixmetry.calibrate.checks.rig_check import rig_findings
 
     adjustment = settled.adjustment
-    found = [*check_determined(adjustment), *in_the_shadow(pattern_findings(tests.patterns or ())), *findings_of(adjustment, tests)]
+    rig = rig_findings(tests.rig, instants_given=adjustment.network.instant is not None)
+    found = [*check_determined(adjustment), *rig, *in_the_shadow(pattern_findings(tests.patterns or ())), *findings_of(adjustment, tests)]
     found += eccentricity_findings(settled.measured, settled.shift)
     return found + hold_out_findings(tests.hold_out, free=_is_free(settled.measured))

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from pixmetry.calibrate.bundle.network import PER_IMAGE, SCALE, SHIFT, Adjustment, Network, State
+from pixmetry.calibrate.bundle.rig import Ties, rig_of
 from pixmetry.core.arrays import Array
 
 RIDGE = 1e-11  # on a unit diagonal: carries the directions that no observation sees (the datum), moves no other
@@ -271,7 +272,7 @@ class AddedTerms:
         return white.ravel()
 
     def _designs(self, network: Network, d: Derivatives) -> tuple[Any, Any]:
-        """Whitened derivatives by cameras and images, and by points, as sparse matrices of 2 m rows."""
+        """Whitened derivatives by cameras and images (or the poses of a rig), and by points, as sparse matrices of 2 m rows."""
         from scipy import sparse
 
         rows, m = self.rows, len(self.rows)
@@ -298,6 +299,11 @@ class AddedTerms:
         places = [place for place, kind in enumerate(kinds) if kind in (SCALE, SHIFT)]
         self._summing_to_zero = [column + images * len(kinds) + place for images in by_owner for place in places if len(images)]
         by_camera = sparse.csr_matrix(_stacked(entries), shape=(2 * m, total))
+        rig = rig_of(network, self.adjustment.state.posed)
+        if rig is not None:
+            ties = Ties(rig, self.adjustment.state, column + np.arange(len(network.images)) * len(kinds), total)
+            by_camera = (by_camera @ ties.T).tocsr()
+            self._summing_to_zero = [np.searchsorted(ties.own, one) for one in self._summing_to_zero]
         by_point = np.where((network.u_xyz[point] > 0)[:, None, :], d.by_point[rows], 0.0)
         columns = np.broadcast_to(3 * point[:, None, None] + np.arange(3), by_point.shape)
         lines = np.broadcast_to(pair[:, :, None], by_point.shape)

@@ -91,6 +91,10 @@ def _dealt(network: Network, folds: int, seed: int) -> tuple[np.ndarray, int]:
     for k in range(len(network.cameras)):
         mine = np.flatnonzero(network.camera_of == k)
         fold_of[rng.permutation(mine)] = np.arange(len(mine)) % folds
+    if network.instant is not None:  # images of one instant go together
+        for t in np.unique(network.instant[network.instant >= 0]):
+            together = np.flatnonzero(network.instant == t)
+            fold_of[together] = fold_of[together[0]]
     return fold_of, folds
 
 
@@ -109,6 +113,7 @@ def subset(network: Network, state: State, images: np.ndarray) -> tuple[Network,
         covariance_px2=network.covariance_px2[kept],
         time_s=None if network.time_s is None else network.time_s[images],
         poses=None,
+        instant=None if network.instant is None else network.instant[images],
     )
     start = replace(
         state,

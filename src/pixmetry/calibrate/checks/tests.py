@@ -14,6 +14,7 @@ from pixmetry.calibrate.checks.known_checks import Kind, KnownFaults, fixed_reco
 from pixmetry.calibrate.checks.known_residuals import bar_residuals, control_residuals, group_record
 from pixmetry.calibrate.checks.patterns import searched_without_bad_images
 from pixmetry.calibrate.checks.residual_grid import systematic_rest
+from pixmetry.calibrate.checks.rig_check import rig_record
 from pixmetry.calibrate.checks.snooping import Rejected, gross_error_records
 from pixmetry.calibrate.records import (
     BarRecord,
@@ -70,6 +71,7 @@ def tests_of(
         curves=curves.distortion_curves(adjustment),
         projection=curves.projection_maps(adjustment),
         network=network_record(adjustment, _stated(faults, "scale_bars"), a_priori=a_priori),
+        rig=rig_record(adjustment),
         known=replace(known_record(adjustment, faults, a_priori=a_priori), fixed_points=fixed_record(adjustment, adjust)),
     )
 

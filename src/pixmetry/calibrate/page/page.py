@@ -32,7 +32,7 @@ from pixmetry.report.provenance import provenance_section
 if TYPE_CHECKING:
     from pixmetry.calibrate.bundle.model import CameraModel
     from pixmetry.calibrate.page.figures import Residuals
-    from pixmetry.calibrate.records import Calibration, DistortionCurves, EccentricityRecord, FieldTest, HoldOut
+    from pixmetry.calibrate.records import Calibration, DistortionCurves, EccentricityRecord, FieldTest, HoldOut, RigRecord
     from pixmetry.core.finding import Finding
 
 WORST_IMAGES = 6  # on each of the two sheets that are not folded
@@ -85,6 +85,8 @@ def page_of(calibration: Calibration) -> Page:
         for k, p in enumerate(pictures):
             if p["lens"]:
                 _channel(lens, calibration, k).add(*p["lens"])
+    if calibration.tests.rig is not None:
+        _rig(page.add_section("Rig", name="rig"), calibration.tests.rig)
     _residuals(page.add_section("Residuals", name="residuals"), calibration, pictures)
     if calibration.tests.hold_out or calibration.tests.field:
         _field_section(page.add_section("Test field, and images left out", name="field"), calibration)
@@ -320,6 +322,33 @@ def _space(section: Section, calibration: Calibration) -> None:
     notes = [n for n in adjustment.notes if not any(n.rstrip(".") in f.text for f in calibration.findings)]
     if notes:
         section.add_section("Notes", Points(notes))
+
+
+def _rig(section: Section, rig: RigRecord) -> None:
+    """Relative poses of cameras that stand still against each other, whether they did, and epipolar distances."""
+    heads = ["Camera", "against", f"Baseline / {rig.unit}", *(f"{axis} / {rig.unit}" for axis in "XYZ"), "Angle / °"]
+    heads += ["ω / °", "φ / °", "κ / °"]
+    section.add(number_table("Relative poses", heads, tables.relative_poses(rig), words=2))
+    words = (
+        "Projection centre in the frame of the other camera (x right, y down, z forwards), and the rotation vector of R: a point X of that "
+        "frame is seen at R (X − X₀)."
+    )
+    if rig.widened > 1:
+        words += f" Uncertainties are {significant(rig.widened, 2)} times those of noise, because the instants scatter."
+    section.add_text(words, style="small soft")
+    if rig.rigid is not None:
+        test = rig.rigid
+        section.add_text(
+            strong("Did the cameras stand still?"),
+            f" Over {rig.instants} instants, each with a pose of its own for every image, relative poses scatter by "
+            f"{significant(test.scatter, 2)} {rig.unit} and {significant(test.scatter_deg, 2)}°; noise explains "
+            f"{significant(test.expected, 2)} {rig.unit} and {significant(test.expected_deg, 2)}° (F = {significant(test.f, 3)}, "
+            f"p = {p_text(test.p)}).",
+        )
+    if rig.epipolar:
+        heads = ["Cameras", "Points", "rms distance / px", "u", "by noise / px"]
+        part = section.add_section("Distances from epipolar lines", number_table("Epipolar distances", heads, tables.epipolar(rig)))
+        part.add_text("In images without distortion, both cameras alike, of the image points that took part.", style="small soft")
 
 
 def _check_points(section: Section, calibration: Calibration) -> None:

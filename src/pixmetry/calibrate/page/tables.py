@@ -37,6 +37,7 @@ if TYPE_CHECKING:
         HoldOut,
         ImageRecord,
         Pattern,
+        RigRecord,
     )
 
 MOST_POINTS = 20  # in the table of those that are known worst
@@ -282,6 +283,24 @@ def _checked_row(point: CheckedPoint, axis: int) -> list[str]:
         NONE if not np.isfinite(off) else signed(off, lambda v: significant(v, 2)),
         NONE if not np.isfinite(ratio) else fixed(ratio, 1),
         str(point.images),
+    ]
+
+
+def relative_poses(rig: RigRecord) -> list[list[str]]:
+    """Cameras of a rig against their references: baseline, position, angle and rotation vector, each ± u."""
+    rows = []
+    for one in rig.cameras:
+        numbers = [(one.baseline, one.u_baseline), *zip(one.position, one.u_position, strict=True), (one.angle_deg, one.u_angle_deg)]
+        numbers += list(zip(one.rotation_deg, one.u_rotation_deg, strict=True))
+        rows.append([one.camera, one.reference, *(_with_u(float(v), float(u), 1.0) for v, u in numbers)])
+    return rows
+
+
+def epipolar(rig: RigRecord) -> list[list[str]]:
+    """Pairs of cameras with the rms distance of their image points from epipolar lines."""
+    return [
+        [f"{one.first} and {one.second}", str(one.n), value(one.rms_px), _two_digits(one.u_rms_px), value(one.expected_px)]
+        for one in rig.epipolar
     ]
 
 

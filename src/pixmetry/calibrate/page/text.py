@@ -218,6 +218,11 @@ def summary_text(calibration: Calibration) -> str:
             lines.append(sentence(found.text))
         lines.append("")
         lines += _parameter_lines(calibration, k)
+    for one in calibration.tests.rig.cameras if calibration.tests.rig is not None else ():
+        apart = uncertain(one.baseline, one.u_baseline, net.unit)
+        angle = uncertain(one.angle_deg, one.u_angle_deg, "°")
+        text = f"{one.camera} stands {apart.value} ± {apart.u} {apart.unit} from {one.reference}, turned by {angle.value}° ± {angle.u}°."
+        lines += ["", text]
     if calibration.tests.check_points is not None:
         lines += ["", sentence(calibration.tests.check_points.text)]
     for finding in calibration.findings:

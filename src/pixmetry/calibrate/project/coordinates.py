@@ -55,6 +55,8 @@ class Measured:
     x_px, y_px : ndarray, shape (n,)
     covariance_px2 : ndarray, shape (n, 3)
     covariance_known : bool
+    instant : ndarray of int, shape (images,), or None
+        Images of one instant of a rig.
     """
 
     images: tuple[str, ...]
@@ -68,6 +70,7 @@ class Measured:
     y_px: np.ndarray
     covariance_px2: np.ndarray
     covariance_known: bool
+    instant: np.ndarray | None = None
 
 
 def measured(

@@ -16,11 +16,19 @@ from pixmetry.calibrate.project.cameras import Described, described
 from pixmetry.calibrate.project.coordinates import ImageCoordinates, Measured, image_facts, measured, upwards
 from pixmetry.calibrate.project.points import Known, known_points, scale_bars, with_check_points
 from pixmetry.calibrate.project.reader import Reader
+from pixmetry.calibrate.project.rig_names import (
+    cameras_of_files,
+    check_instants,
+    instants_of_lists,
+    instants_of_names,
+    instants_of_table,
+)
 from pixmetry.calibrate.project.schema import PROJECT_SCHEMA, PicturesModel, ProjectModel
 from pixmetry.calibrate.project.straight_lines import LinePositions, lines_of_pictures, lines_of_table
 from pixmetry.calibrate.project.tables import Table, first_few
 from pixmetry.camera.camera import Camera
 from pixmetry.core.config import Settings, load_yaml, validate
+from pixmetry.core.errors import InputError
 from pixmetry.core.finding import Finding
 from pixmetry.core.progress import Progress
 
@@ -89,9 +97,14 @@ def load_project(path: str | Path, progress: Progress | None = None) -> Project:
 
 
 def project_of_pictures(
-    files: Sequence[str | Path], camera: Mapping[str, Any], plate: Mapping[str, Any], progress: Progress | None = None
+    files: Sequence[str | Path],
+    camera: Mapping[str, Any],
+    plate: Mapping[str, Any],
+    progress: Progress | None = None,
+    *,
+    rig: bool = False,
 ) -> Project:
-    """A project of pictures of one camera alone.
+    """A project of pictures alone, of one camera, or of the cameras of a rig.
 
     Parameters
     ----------
@@ -100,14 +113,20 @@ def project_of_pictures(
     camera, plate : mapping
         Keys of the project's ``cameras`` and ``pictures``.
     progress : callable, optional
+    rig : bool
+        Whether the names of the pictures tell several cameras, and the instants.
 
     Raises
     ------
     InputError
         As from `load_project`.
     """
-    pictures = {"files": [str(file) for file in files], **plate}
-    model = validate(ProjectModel, {"schema": PROJECT_SCHEMA, "cameras": [camera], "pictures": pictures})
+    pictures: dict[str, Any] = {"files": [str(file) for file in files], **plate}
+    settings: dict[str, Any] = {"schema": PROJECT_SCHEMA, "cameras": [camera], "pictures": pictures}
+    if rig:
+        pictures["files"] = cameras_of_files(Reader(None, {}).pictures(pictures["files"], plate.get("raw")))
+        settings |= {"cameras": [{**camera, "name": name} for name in pictures["files"]], "rig": "names"}
+    model = validate(ProjectModel, settings)
     return _project(model, Reader(None, {}), progress)
 
 
@@ -127,12 +146,11 @@ def _project(model: ProjectModel, reader: Reader, progress: Progress | None) -> 
     images, points = reader.table("images", model.images), reader.table("points", model.points)
     plate, findings = None, ()
     if model.pictures is not None:
-        files = reader.pictures(model.pictures.files, model.pictures.raw)
-        camera, seen, plate, findings = _locate_targets(model.pictures, files, cameras[0], images, progress, told[0].check)
-        cameras = (camera,)
+        cameras, seen, plate, findings = _located(model.pictures, reader, told, images, progress)
     else:
         assert table is not None and model.observations is not None
         seen = measured(table, images, cameras, given, model.observations.u_px)
+    seen = replace(seen, instant=_instants(model, images, seen, reader))
     known = plate if points is None and plate is not None else known_points(points, seen.points, *_trust(model))
     compared = reader.table("check_points", model.check_points)
     u_compared = None if model.check_points is None else model.check_points.u
@@ -150,7 +168,7 @@ def _lines(
 ) -> tuple[CameraModel, LinePositions, tuple[Finding, ...]]:
     """Positions on straight lines, and the camera with the size of its frame."""
     if model.pictures is not None:
-        lines, size, findings = lines_of_pictures(model.pictures, reader.pictures(model.pictures.files, model.pictures.raw), progress)
+        lines, size, findings = lines_of_pictures(model.pictures, reader.pictures(model.pictures.all_files, model.pictures.raw), progress)
         told.check(size)
         return _of_size(told.model, *size), lines, findings
     assert table is not None and model.lines is not None
@@ -196,6 +214,7 @@ def network_of(cameras: Sequence[CameraModel], seen: Measured, known: Known, **m
         normal=known.normal,
         covariance_known=seen.covariance_known,
         poses=seen.poses,
+        instant=seen.instant,
         **more,
     )
 
@@ -299,6 +318,69 @@ def _locate_targets(
         **{name: getattr(network, name) for name in ("image", "point", "x_px", "y_px", "covariance_px2", "covariance_known")},
     )
     return network.cameras[0], seen, Known(network.xyz, network.u_xyz, network.diameter, network.normal), found.findings
+
+
+def _located(
+    wanted: PicturesModel, reader: Reader, told: Sequence[Described], images: Table | None, progress: Progress | None
+) -> tuple[tuple[CameraModel, ...], Measured, Known, tuple[Finding, ...]]:
+    """Locate the targets in the pictures of all cameras."""
+    if not isinstance(wanted.files, dict):
+        files = reader.pictures(wanted.files, wanted.raw)
+        camera, seen, plate, findings = _locate_targets(wanted, files, told[0].model, images, progress, told[0].check)
+        return (camera,), seen, plate, findings
+    parts = []
+    for one in told:
+        files = reader.pictures(wanted.files[one.model.name], wanted.raw)
+        parts.append(_locate_targets(wanted, files, one.model, None, progress, one.check))
+    names = [name for _, seen, _, _ in parts for name in seen.images]
+    own = [f"{camera.name}/" if len(set(names)) < len(names) else "" for camera, _, _, _ in parts]
+    images_of = tuple(f"{head}{name}" for head, (_, seen, _, _) in zip(own, parts, strict=True) for name in seen.images)
+    index: dict[str, int] = {}
+    point = [np.array([index.setdefault(name, len(index)) for name in seen.points], np.int64)[seen.point] for _, seen, _, _ in parts]
+    first = np.cumsum([0, *(len(seen.images) for _, seen, _, _ in parts)])
+    _, time_s, poses = (None, None, None) if images is None else image_facts(images, images_of, [told[0].model], lambda name: name)
+    seen = Measured(
+        images=images_of,
+        points=tuple(index),
+        camera_of=np.repeat(np.arange(len(parts)), np.diff(first)),
+        time_s=time_s,
+        poses=poses,
+        image=np.concatenate([part.image + at for (_, part, _, _), at in zip(parts, first[:-1], strict=True)]),
+        point=np.concatenate(point),
+        x_px=np.concatenate([part.x_px for _, part, _, _ in parts]),
+        y_px=np.concatenate([part.y_px for _, part, _, _ in parts]),
+        covariance_px2=np.concatenate([part.covariance_px2 for _, part, _, _ in parts]),
+        covariance_known=all(part.covariance_known for _, part, _, _ in parts),
+    )
+    known = _joined([(part, own) for _, part, own, _ in parts], index)
+    return tuple(camera for camera, _, _, _ in parts), seen, known, tuple(one for _, _, _, findings in parts for one in findings)
+
+
+def _joined(parts: Sequence[tuple[Measured, Known]], index: Mapping[str, int]) -> Known:
+    """What is known of the points of all cameras: a board that each of them saw."""
+    n, (_, first) = len(index), parts[0]
+    xyz, u_xyz = np.full((n, 3), np.nan), np.full((n, 3), np.inf)
+    diameter = None if first.diameter is None else np.full(n, np.nan)
+    normal = None if first.normal is None else np.full((n, 3), np.nan)
+    for seen, known in parts:
+        rows = [index[name] for name in seen.points]
+        for to, of in ((xyz, known.xyz), (u_xyz, known.u_xyz), (diameter, known.diameter), (normal, known.normal)):
+            if to is not None and of is not None:
+                to[rows] = of
+    return Known(xyz, u_xyz, diameter, normal)
+
+
+def _instants(model: ProjectModel, images: Table | None, seen: Measured, reader: Reader) -> np.ndarray | None:
+    """Which images were taken together by a rig; None without one."""
+    where = reader.where("rig")
+    told = None if images is None or len(model.cameras) < 2 else instants_of_table(images.spelled("image", "instant"), seen.images)
+    if told is not None and model.rig is not None:
+        raise InputError("instants are given twice", where=where, allowed="`rig`, or the column instant", remedy="delete one of them")
+    if model.rig == "names":
+        told = instants_of_names(seen.images, seen.camera_of, where)
+    elif model.rig is not None:
+        told = instants_of_lists(model.rig, seen.images, where)
+    return None if told is None else check_instants(told, seen.camera_of, seen.images, where)
 
 
 def _of_size(camera: CameraModel, cols: int, rows: int) -> CameraModel:

@@ -139,10 +139,13 @@ class LinesModel(TableModel):
     u_px: Positive | None = None
 
 
-class PicturesModel(Model):
-    """Images in which targets are located."""
+Files = Annotated[tuple[str, ...], BeforeValidator(_one)]
 
-    files: Annotated[tuple[str, ...], Field(min_length=1), BeforeValidator(_one)]
+
+class PicturesModel(Model):
+    """Images in which targets are located; of several cameras the files of each, by its name."""
+
+    files: Annotated[Files | dict[Name, Files], Field(min_length=1)]
     kind: Literal["chessboard", "dots", "coded", "squares", "lines"] = "chessboard"
     grid: str | None = None
     pitch: Positive | tuple[Positive, Positive] | None = None
@@ -158,6 +161,11 @@ class PicturesModel(Model):
         if self.raw is not None:
             parse_raw(self.raw)
         return self
+
+    @property
+    def all_files(self) -> tuple[str, ...]:
+        """Those of all cameras."""
+        return tuple(name for own in self.files.values() for name in own) if isinstance(self.files, dict) else self.files
 
     @model_validator(mode="after")
     def _plate(self) -> PicturesModel:
@@ -234,6 +242,7 @@ class ProjectModel(Model):
     scale_bars_table: Annotated[TableModel | None, BeforeValidator(_table)] = None
     per_image: Annotated[tuple[Literal[PER_IMAGE_NAMES], ...], BeforeValidator(_listed)] = ()  # type: ignore[valid-type]
     scale_origin_px: float = 0.0
+    rig: Literal["names"] | tuple[tuple[Name, ...], ...] | None = None
     options: OptionsModel = OptionsModel()
 
     @model_validator(mode="before")
@@ -257,13 +266,19 @@ class ProjectModel(Model):
             what = "image coordinates from two sources" if given else "no image coordinates"
             allowed = "observations (a table), lines (a table) or pictures (images of targets)"
             raise InputError(what, allowed=allowed, remedy="delete one of them" if given else "add one of them")
-        if self.pictures is not None and len(self.cameras) > 1:
-            remedy = "write one project for each camera, or locate first and give a table of image coordinates"
-            raise InputError("pictures of several cameras", allowed="pictures of one camera", remedy=remedy)
+        if self.pictures is not None and not isinstance(self.pictures.files, dict) and len(self.cameras) > 1:
+            allowed = "`files` with the pictures of each camera"
+            remedy = f'write `files: {{{self.cameras[0].name}: "…", {self.cameras[1].name}: "…"}}`'
+            raise InputError("pictures of several cameras", where="pictures.files", allowed=allowed, remedy=remedy)
         if self.pictures is not None and "image_coordinates" in self.model_fields_set:
             what = "image_coordinates have no meaning with pictures, whose coordinates are pixmetry's own"
             raise InputError(what, allowed="with observations or lines from a table", remedy="delete it")
         names = [camera.name for camera in self.cameras]
+        if self.pictures is not None and isinstance(self.pictures.files, dict) and set(self.pictures.files) != set(names):
+            what, value, allowed = "pictures are not of the cameras", ", ".join(self.pictures.files), ", ".join(names)
+            raise InputError(what, where="pictures.files", value=value, allowed=allowed, remedy="name each camera once in both")
+        if self.rig is not None and len(names) < 2:
+            raise InputError("a rig of one camera", where="rig", allowed="two cameras and more", remedy="delete it, or add the others")
         if len(set(names)) < len(names):
             raise InputError("two cameras of one name", value=", ".join(names), allowed="each name once", remedy="name them")
         if self.pictures is None and any(c.cols is None and c.camera is None and c.start_from is None for c in self.cameras):

@@ -198,7 +198,7 @@ class Reconstruction:
             points=tuple(self.network.points[j] for j in points), x_px=self.network.x_px[rows], y_px=self.network.y_px[rows],
             image=image, point=point, covariance_px2=np.tile([variance, 0.0, variance], (len(rows), 1)),
             xyz=np.where(control, self.network.xyz[points], np.nan), u_xyz=np.where(control, self.network.u_xyz[points], np.inf),
-            bars=ScaleBars.none(), per_image=(), time_s=None, diameter=None, normal=None, poses=None,
+            bars=ScaleBars.none(), per_image=(), time_s=None, diameter=None, normal=None, poses=None, instant=None,
         )  # fmt: skip
         zero = np.zeros(len(images))
         start = State(self.interior[cameras], self.rotation[images], self.position[images], zero, zero, self.xyz[points])
