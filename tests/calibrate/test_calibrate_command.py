@@ -529,3 +529,24 @@ def test_the_door_stays_open(tmp_path: Path) -> None:
     )
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, env=os.environ.copy()).stdout
     assert not {"numpy", "numba", "pydantic", "scipy"} & set(said.partition("MODULES")[2].split())
+
+
+def test_a_field_that_fits_no_camera_is_not_calibrated(tmp_path: Path, rng: np.random.Generator) -> None:
+    """A board that bends in its plane from picture to picture, by up to 0.08 squares: no numbers of its corners fit. Exit status 1."""
+    import imagecodecs
+
+    whole = chessboard(7, 6)
+    for k, (roll, *tilt) in enumerate([(0, 25, 0), (90, -25, 5), (10, 0, 25), (100, 5, -25), (45, 20, 20), (0, -20, 15)]):
+        view = View((3.0, 2.5), 14.0, roll, *tilt)
+        phase = rng.uniform(0, 2 * np.pi)
+
+        def bent(x: np.ndarray, y: np.ndarray, phase: float = phase) -> np.ndarray:
+            return whole(x + 0.08 * np.sin(1.9 * y + phase), y + 0.08 * np.sin(1.7 * x - phase))
+
+        (tmp_path / f"{k}.png").write_bytes(imagecodecs.png_encode(view.frame(bent, rng)))
+    result = run(tmp_path, "--grid", "7x6", "--pitch-mm", 10, "--c-px", 600, "--free", "c,xp,yp,k1", "-o", tmp_path / "out")
+    assert result.exit_code == 1, result.output
+    assert "Not calibrated" in result.output and "Error: This is no calibration" in " ".join(result.output.split())
+    (finding,) = [f for f in json.loads((tmp_path / "out" / "calibration.json").read_text())["findings"] if f["level"] == "error"]
+    assert finding["kind"] == "misfit" and finding["numbers"]["rms_px"] > 1
+    assert "Not calibrated" in (tmp_path / "out" / "report.html").read_text()

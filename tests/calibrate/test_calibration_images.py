@@ -259,6 +259,14 @@ def test_images_that_fail_are_named_with_a_reason(rng: np.random.Generator) -> N
         observations_of([frames[0], empty, frames[1]], "chessboard", grid="7x6", pitch=1.0)
 
 
+def test_a_field_that_few_images_show_is_refused(rng: np.random.Generator) -> None:
+    """Three of ten: they may show something else."""
+    frames = [view.frame(dots(6, 5), rng) for view in of_board(6, 5, 13.0, (0.0, 10.0, -10.0))]
+    larger = of_board(7, 5, 13.0, (0.0,))[0].frame(dots(7, 5), rng)
+    with pytest.raises(MeasureError, match=r"3 of 10 images only.*7 × 5, not 6 × 5 \(7 images\)"):
+        observations_of([*frames, *[larger] * 7], "dots", grid="6x5", pitch=1.0)
+
+
 def test_each_dot_has_its_coordinates_and_their_covariance(rng: np.random.Generator) -> None:
     views = of_board(5, 4, 11.0, (0.0,))
     seen = observations_of([views[0].frame(dots(5, 4), rng)], "dots", grid="any", pitch=(2.0, 3.0), least_images=1)

@@ -8,9 +8,16 @@ from scipy import stats
 from scipy.ndimage import gaussian_filter
 
 from pixmetry.core.errors import InputError
+from pixmetry.locate.detect.grids import Grid
 from pixmetry.locate.detect.targets import Flag
 from pixmetry.locate.noise import NoiseModel
-from pixmetry.locate.template.corners import chessboard_reach_px, corner_positions, find_chessboard
+from pixmetry.locate.template.corners import (
+    chessboard_reach_px,
+    corner_positions,
+    find_chessboard,
+    numbered_by_colours,
+    without_slips,
+)
 
 HALF = 12
 SIDE = 2 * HALF + 1
@@ -164,6 +171,49 @@ def test_finds_and_refines_a_chessboard_in_perspective(dtype: type, rng: np.rand
     off = np.stack([found.x_px, found.y_px]) - true[:, nearest]
     worst = np.hypot(*(off / np.sqrt([found.var_x_px2, found.var_y_px2]))).max()
     assert worst < 7.5  # 6.5 by chance once in 1e6 even if x and y were fully correlated; the rest is the drawing's raster (0.002 px)
+
+
+@pytest.mark.parametrize(("cols", "rows"), [(8, 5), (7, 5), (6, 6), (7, 7)])
+def test_a_chessboard_is_numbered_by_its_colours_from_whichever_corner_it_was_counted(cols: int, rows: int) -> None:
+    """A finder may count from any corner and in a mirror; the picture may be turned. The first square is dark then, columns turn to rows as
+    x does to y, and where the colours leave a choice the columns run towards x."""
+    side = 12
+    row, col = (v.ravel() for v in np.indices((rows, cols)))
+    board = (np.indices((rows + 1, cols + 1)).sum(axis=0) % 2).repeat(side, 0).repeat(side, 1) * 200.0  # its first outer square is dark
+    for quarters in range(4):
+        frame = np.ascontiguousarray(np.rot90(board, quarters))
+        place = np.stack(np.meshgrid(np.arange(1, frame.shape[1] // side), np.arange(1, frame.shape[0] // side)), axis=2) * side - 0.5
+        ways = [np.rot90(place, k) for k in range(4)]
+        ways = [one for way in ways for one in (way, way[:, ::-1], way[::-1]) if one.shape[:2] == (rows, cols)]
+        found = {}
+        for way in ways:
+            grid = numbered_by_colours(frame, Grid(*way.reshape(-1, 2).T, row, col, rows, cols))
+            assert not grid.message
+            at = np.stack([grid.x_px, grid.y_px], axis=1).reshape(rows, cols, 2)
+            across, down = at[0, 1] - at[0, 0], at[1, 0] - at[0, 0]
+            assert across[0] * down[1] - across[1] * down[0] > 0
+            x, y = np.rint(at[:2, :2].mean(axis=(0, 1))).astype(int)
+            assert frame[y, x] == 0
+            found[tuple(at.ravel())] = across
+        (across,) = found.values()
+        if rows + cols & 1 == 0 and rows % 2 == 0:
+            assert across[0] > 0
+    grey = numbered_by_colours(np.full_like(board, 90.0), Grid(*place.reshape(-1, 2).T, row, col, rows, cols)) if rows == cols else None
+    assert grey is None or ("do not alternate" in grey.message and not len(grey))
+
+
+def test_a_corner_that_the_finder_put_into_a_square_is_put_back(rng: np.random.Generator) -> None:
+    """8 × 6 corners in perspective; two, one of them at the rim, are off by a quarter of a square."""
+    row, col = np.indices((6, 8))
+    w = 1 + 0.02 * col - 0.015 * row
+    true = np.stack([(40 * col + 6 * row) / w + 50, (38 * row - 3 * col) / w + 60], axis=2)
+    seen = true + rng.normal(0, 0.1, true.shape)
+    slipped = seen.copy()
+    slipped[2, 3] += (7.0, -7.0)
+    slipped[0, 6] += (-8.0, 4.0)
+    mended = without_slips(slipped)
+    assert np.abs(mended - true).max() < 1.2
+    assert (without_slips(seen) == seen).all()
 
 
 def test_the_directions_of_the_edges_and_their_order() -> None:

@@ -180,3 +180,26 @@ def test_eight_bits_keep_what_matters(rng: np.random.Generator) -> None:
     assert np.abs(eight_bit(frame.astype(np.float32) * 1e-6 - 1e-4).astype(int) - frame).max() <= 2
     assert eight_bit(np.full((5, 5), 7.5, np.float32)).dtype == np.uint8
     assert np.ptp(eight_bit(np.where(np.arange(5000).reshape(50, 100) == 77, 4000, 12).astype(np.uint16))) > 200
+
+
+def test_a_plate_of_known_size_is_numbered_whole_or_refused(rng: np.random.Generator) -> None:
+    """A plate of 10 × 8: with dots of something else in the next row it is numbered right; one with a real row more, with a row or a column
+    less, or with a row that only a stray dot stands for, is refused by name. 20 plates of each."""
+
+    def rows_of(first: int, stop: int, keep: int = 10) -> tuple[np.ndarray, ...]:
+        x, y, i, j = plate(rng, 10, 10, tilt_deg=rng.uniform(0, 40), distortion=rng.uniform(-0.1, 0.1))
+        use = (i >= first) & (i < stop) & ((i < stop - 1) | (j < keep))
+        return x[use], y[use], i[use] - first, j[use]
+
+    for _ in range(20):
+        x, y, i, j = rows_of(0, 9, keep=2)
+        grid = order_grid(x, y, pattern=(10, 8))
+        inside = i < 8
+        assert not grid.message and (grid.placed == inside).all() and agreeing(grid, i, j) == 80
+        x, y, i, j = rows_of(0, 9)
+        assert "not 10 × 8" in order_grid(x, y, pattern=(10, 8)).message
+        x, y, i, j = rows_of(0, 8, keep=1)
+        message = order_grid(x, y, pattern=(10, 8)).message
+        assert "hardly there" in message or "not 10 × 8" in message
+        x, y, i, j = rows_of(0, 7)
+        assert order_grid(x, y, pattern=(10, 8)).message

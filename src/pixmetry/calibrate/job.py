@@ -80,7 +80,8 @@ def calibrate(
     Returns
     -------
     Calibration or LineCalibration
-        The latter from straight lines.
+        The latter from straight lines. Where targets in pictures do not fit any camera, its first finding, ``"misfit"``, is of level
+        "error", and no ``camera.yaml`` is written.
 
     Raises
     ------
@@ -110,6 +111,7 @@ def calibrate(
     ('c', True)
     """
     from pixmetry.calibrate.bundle.solve import calibrate_network
+    from pixmetry.calibrate.checks.findings import misfit_findings
 
     import_extra("cv2")
     of = _sources(source)
@@ -139,9 +141,12 @@ def calibrate(
     if checks is not None:
         step("comparing with the check points")
         calibration = with_check_points(calibration, checks, a_priori=chosen.a_priori)
-    cameras, missing = _camera_files(calibration, project)
+    misfit = []
+    if project is not None and project.of_pictures:
+        misfit = misfit_findings(calibration.adjustment, network.covariance_px2)
+    cameras, missing = _camera_files(calibration, project) if not misfit else ({}, [])
     about = {field.name: getattr(chosen, field.name) for field in fields(chosen)}
-    findings = (*calibration.findings, *missing, *(project.findings if project is not None else ()))
+    findings = (*misfit, *calibration.findings, *missing, *(project.findings if project is not None else ()))
     calibration = replace(calibration, findings=findings, provenance={**calibration.provenance, **_origin(project, about)})
     if output is not None:
         step("writing the results")

@@ -15,6 +15,7 @@ KINDS = ("chessboard", "dots", "coded", "squares", "lines")
 if TYPE_CHECKING:
     from pixmetry.report import Page
 
+EXIT_NOT_CALIBRATED = 1
 OPTIONS = ("field", "loss", "folds", "residual_grid", "snoop", "a_priori")
 
 
@@ -140,6 +141,8 @@ def calibrate(
     The folder of results gets report.html, calibration.json, residuals.csv, points.csv and poses.csv (straight lines have no points and no
     poses). An export that OpenCV or COLMAP cannot hold is refused with the reason. The results are written even then.
 
+    The exit status is 1 if the image coordinates fit no camera: the results then say why, and are no calibration.
+
     docs/calibrating.md explains every key of a project file and every message.
     """
     from pixmetry.calibrate.files.record import LINES_SCHEMA, RESULT_SCHEMA, cameras_text
@@ -165,6 +168,8 @@ def calibrate(
     if opencv is not None or colmap is not None:
         for sentence in write_exports(_models(calibration), opencv, colmap, may_lose_px, read):
             echo(sentence, err=written.printed)
+    if any(finding.level == "error" for finding in calibration.findings):
+        raise click.exceptions.Exit(EXIT_NOT_CALIBRATED)
 
 
 def _summary(calibration: Any, report: Path) -> str:

@@ -25,9 +25,13 @@ from pixmetry.calibrate.records import (
     ParameterTest,
     Tests,
 )
-from pixmetry.core.finding import Finding
+from pixmetry.core.arrays import Array
+from pixmetry.core.finding import LEVELS, Finding
 
+MISFIT_PX, MISFIT_U = 1.0, 20.0  # rms of residuals, and over the stated uncertainty, from which both say that nothing was calibrated
+MISFIT_LOST = 0.3  # share of the image coordinates left out that says so
 ORDER = (  # of kinds, among findings of the same level; what is not named here comes between the two parts
+    "misfit",
     "start", "determination", "images_left_out", "x_scale_drift", "bad_images", "images_rejected", "correlation", "flatness", "lost_points",
     "known_untested", "gross_scale_bar", "gross_control_point", "lost_control",
     "x_shift", "field", "known_uncertainty", "eccentricity", "f_test", "gross_error", None,
@@ -48,11 +52,11 @@ RADIAL = frozenset(("k1", "k2", "k3", "k4", "k5"))
 
 
 def in_order(findings: Iterable[Finding]) -> tuple[Finding, ...]:
-    """Warnings first; then by what matters most for the result, notes no more than a few. The same sentence is said once."""
+    """Errors and warnings first; then by what matters most for the result, notes no more than a few. The same sentence is said once."""
     rank = {kind: i for i, kind in enumerate(ORDER)}
     unique = dict.fromkeys(findings)
-    ordered = sorted(unique, key=lambda f: (f.level != "warning", rank.get(f.kind, rank[None])))
-    warnings = sum(f.level == "warning" for f in ordered)
+    ordered = sorted(unique, key=lambda f: (-LEVELS.index(f.level), rank.get(f.kind, rank[None])))
+    warnings = sum(f.level != "note" for f in ordered)
     return tuple(ordered[: max(MOST, warnings + LEAST_NOTES)])
 
 
@@ -141,6 +145,32 @@ def f_test_findings(f_tests: Mapping[str, FTest]) -> list[Finding]:
 def mostly_rejected(images: Sequence[ImageRecord]) -> list[ImageRecord]:
     """Records of the images that lost more than half of their image points as gross errors."""
     return [i for i in images if i.rejected > REJECTED_SHARE * i.measured]
+
+
+def misfit_findings(adjustment: Adjustment, covariance_px2: Array) -> list[Finding]:
+    """That image coordinates of targets in pictures do not fit the camera: numbers of targets, or what was said of the field, are wrong.
+
+    ``covariance_px2``, shape (n, 3): as they were measured.
+    """
+    used = adjustment.used & np.isfinite(adjustment.residual_px).all(axis=1)
+    if not used.any():
+        return []
+    rms_px = float(np.sqrt((adjustment.residual_px[used] ** 2).mean()))
+    u_px = float(np.sqrt(np.median(covariance_px2[used][:, [0, 2]])))
+    lost = float(1 - used.mean())
+    if not (rms_px > MISFIT_PX and rms_px > MISFIT_U * u_px) and lost < MISFIT_LOST:
+        return []
+    size = f"{plain(rms_px, 3)} px rms, {plain(rms_px / u_px, 2)} times their uncertainty"
+    what = f"the image coordinates of the targets miss the camera by {size}"
+    if lost >= MISFIT_LOST:
+        what = f"{100 * lost:.0f} % of the image coordinates of the targets do not fit the camera and were left out"
+    text = f"This is no calibration: {what}. Targets were numbered wrongly, or the field is not as stated."
+    advice = (
+        "Check kind, grid and pitch against the field, and the pictures for parts of another field; "
+        "if they are right, the lens is of another model than this one (a fisheye), or the field bends from picture to picture."
+    )
+    numbers = {"rms_px": rms_px, "u_px": u_px, "left_out_share": lost}
+    return [Finding("misfit", text, advice, "error", numbers)]
 
 
 def rejected_image_findings(images: Sequence[ImageRecord]) -> list[Finding]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from pixmetry.calibrate.bundle.model import CameraModel
 from pixmetry.calibrate.bundle.network import Network
-from pixmetry.calibrate.images.numbering import chessboard_reference, consistent
+from pixmetry.calibrate.images.numbering import consistent
 from pixmetry.calibrate.images.targets import KINDS, Seen, Wanted, board_size, see
 from pixmetry.camera.camera import Camera
 from pixmetry.core.errors import InputError, MeasureError
@@ -22,8 +22,11 @@ from pixmetry.files.formats import PICTURE_ENDINGS, frame_name
 from pixmetry.files.images import picture_files
 from pixmetry.files.raw_values import RawLayout, layout_of
 from pixmetry.locate.noise import NoiseModel, noise_model
+from pixmetry.locate.template.corners import chessboard_turns
 
 LEAST_IMAGES = 3
+NAMED_REASONS = 3
+LEAST_IMAGE_SHARE = 1 / 3  # of all images: where fewer show the board, those that do may show something else
 
 
 @dataclass(frozen=True)
@@ -247,6 +250,12 @@ def _check_enough(seen: list[Seen], good: list[Seen], wanted: Wanted, least: int
         what = f"{len(good)} of {len(seen)} images can be used ({each})"
         remedy = "check kind, grid and polarity, or take more images of the whole board"
         raise MeasureError(what, where="images", allowed=f"{least} or more", remedy=remedy)
+    if len(good) < LEAST_IMAGE_SHARE * len(seen):
+        reasons = Counter(s.reason for s in seen if s.reason).most_common(NAMED_REASONS)
+        said = "; ".join(f"{reason} ({count} images)" if count > 1 else reason for reason, count in reasons)
+        what = f"the test field was identified in {len(good)} of {len(seen)} images only; in the others: {said}"
+        remedy = "check kind, grid and polarity: part of the field may pass for all of it; else leave out images that do not show it"
+        raise MeasureError(what, where="images", allowed="a third of them or more", remedy=remedy)
     if wanted.kind == "dots" and wanted.grid is None and len(good) > 1:
         what = "parts of a plate cannot be numbered consistently over several images"
         raise InputError(what, where="grid", value="any", allowed="COLSxROWS of the whole plate; any for a single image")
@@ -257,7 +266,7 @@ def _numbered(good: list[Seen], kind: str) -> tuple[list[Seen], tuple[Finding, .
     if kind == "coded":
         return good, ()
     rows, cols = good[0].extent
-    boards, findings = consistent([s.board for s in good], chessboard_reference(rows - 1, cols - 1) if kind == "chessboard" else None)
+    boards, findings = consistent([s.board for s in good], chessboard_turns(rows, cols) if kind == "chessboard" else None)
     return [replace(s, keys=np.column_stack([b.row, b.col])) for s, b in zip(good, boards, strict=True)], findings
 
 

@@ -63,28 +63,6 @@ def column_angle_deg(board: Board) -> float:
     return float(np.degrees(np.arctan2(step[1], step[0])))
 
 
-def chessboard_marks(frame: np.ndarray, board: Board) -> Marks:
-    """Colours of the squares between the inner corners: 1 dark, −1 bright, by the sign of the difference from the squares beside."""
-    place = np.full((board.rows, board.cols, 2), np.nan)
-    place[board.row, board.col] = np.column_stack([board.x_px, board.y_px])
-    middle = 0.25 * (place[:-1, :-1] + place[1:, :-1] + place[:-1, 1:] + place[1:, 1:])
-    row, col = np.nonzero(np.isfinite(middle).all(axis=2))
-    x, y = np.rint(middle[row, col]).astype(int).T
-    grey = np.full(middle.shape[:2], np.nan)
-    grey[row, col] = frame[np.clip(y, 0, frame.shape[0] - 1), np.clip(x, 0, frame.shape[1] - 1)]
-    beside = np.pad(grey, 1, constant_values=np.nan)
-    around = np.stack([beside[:-2, 1:-1], beside[2:, 1:-1], beside[1:-1, :-2], beside[1:-1, 2:]])
-    count = np.isfinite(around).sum(axis=0)
-    mean = np.where(count > 0, np.nansum(around, axis=0) / np.maximum(count, 1), np.nan)
-    value = np.nan_to_num(np.sign(mean - grey))
-    return Marks(row, col, value[row, col], board.rows - 1, board.cols - 1)
-
-
-def chessboard_reference(rows: int, cols: int) -> np.ndarray:
-    """Colours of those squares on a board whose first one is dark."""
-    return np.where(np.add.outer(np.arange(rows), np.arange(cols)) % 2 == 0, 1.0, -1.0)
-
-
 def dot_marks(board: Board, area_px: np.ndarray) -> Marks:
     """Dots that are larger (1) or smaller (−1) than those around them."""
     from scipy.spatial import cKDTree
@@ -96,15 +74,16 @@ def dot_marks(board: Board, area_px: np.ndarray) -> Marks:
     return Marks(board.row, board.col, value, board.rows, board.cols)
 
 
-def consistent(boards: Sequence[Board], reference: np.ndarray | None = None) -> tuple[list[Board], tuple[Finding, ...]]:
+def consistent(boards: Sequence[Board], alike: tuple[int, ...] | None = None) -> tuple[list[Board], tuple[Finding, ...]]:
     """Number a board in all of its images from the same corner.
 
     Parameters
     ----------
     boards : sequence of Board
         Of one pattern, in the order in which the images were taken; columns turn to rows as x does to y.
-    reference : ndarray, shape (rows, cols) of the marks, optional
-        What the marks of an image are to agree with; by default those of the images before, if most images show equally many.
+    alike : tuple of int, optional
+        Quarters of a turn after which the board looks the same, where each image alone rules out the others; by default those that map
+        its rows and columns onto themselves, and marks decide: those of the images before, if most images show equally many.
 
     Returns
     -------
@@ -118,13 +97,12 @@ def consistent(boards: Sequence[Board], reference: np.ndarray | None = None) -> 
     are ruled out; of the rest the one is taken that rotates the board least against the image before, or, in the first image, against
     upright.
     """
-    known = None if reference is None else np.asarray(reference, float)
-    if reference is None:
-        boards = _with_trusted_marks(boards)
+    known: np.ndarray | None = None
+    boards = _with_trusted_marks(boards)
     out: list[Board] = []
     open_turns, widest, previous = 1, 0.0, 0.0
     for board in boards:
-        turns = (0, 1, 2, 3) if board.rows == board.cols else (0, 2)
+        turns = alike or ((0, 1, 2, 3) if board.rows == board.cols else (0, 2))
         choices = [turned(board, k) for k in _agreeing(board, turns, known)]
         off = [abs(_wrapped(column_angle_deg(b) - previous)) for b in choices]
         best = choices[int(np.argmin(off))]
@@ -132,7 +110,7 @@ def consistent(boards: Sequence[Board], reference: np.ndarray | None = None) -> 
             open_turns = max(open_turns, len(choices))
             widest = max(widest, min(off) * len(choices))
         previous = column_angle_deg(best)
-        if reference is None and best.marks is not None:
+        if best.marks is not None:
             known = _laid_down(best.marks) + (0.0 if known is None else known)
         out.append(best)
     return out, _findings(open_turns, widest, len(out))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pixmetry.calibrate.images.numbering import Board, Marks, chessboard_marks, dot_marks
+from pixmetry.calibrate.images.numbering import Board, Marks, dot_marks
 from pixmetry.core.arrays import Flags
 from pixmetry.core.errors import InputError
 from pixmetry.files.formats import Decoded
@@ -145,13 +145,7 @@ def _chessboard(name: str, frame: np.ndarray, wanted: Wanted) -> Seen:
     use = _usable(found)
     if use.sum() < 3:
         return _nothing(name, frame, "its corners could not be identified" if len(found) else found.images[0]["reason"])
-    row, col = found["grid_row"], found["grid_col"]
-    design = np.column_stack([col, row, np.ones(len(row))])[use]
-    steps = np.linalg.lstsq(design, np.column_stack([found.x_px, found.y_px])[use], rcond=None)[0]
-    if steps[0, 0] * steps[1, 1] - steps[0, 1] * steps[1, 0] < 0:  # columns and rows were counted as in a mirror
-        col = cols - 1 - col
-    seen = _seen(name, frame, found, np.column_stack([row, col]), use, (rows, cols))
-    return replace(seen, marks=chessboard_marks(frame, seen.board))
+    return _seen(name, frame, found, np.column_stack([found["grid_row"], found["grid_col"]]), use, (rows, cols))
 
 
 def _dots(name: str, frame: np.ndarray, wanted: Wanted) -> Seen:

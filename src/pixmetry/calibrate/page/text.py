@@ -110,6 +110,9 @@ def worth(calibration: Calibration, camera: int) -> str:
     name = calibration.adjustment.network.cameras[camera].name
     if found.n == 0:
         return "No image coordinate of this camera was used."
+    if any(finding.level == "error" for finding in calibration.findings):
+        in_x, in_y = length(found.rms_x_px, found.rms_x_um), length(found.rms_y_px, found.rms_y_um)
+        return f"Not calibrated: residuals are {in_x} rms in x and {in_y} in y."
     text = (
         f"The image coordinates agree with the calibrated camera to {length(found.rms_x_px, found.rms_x_um)} rms in x and "
         f"{length(found.rms_y_px, found.rms_y_um)} in y"

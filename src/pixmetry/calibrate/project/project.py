@@ -58,6 +58,8 @@ class Project:
         Positions on straight lines, where there are no points.
     check_points : CheckPoints or None
         What the result is compared with.
+    of_pictures : bool
+        Whether the image coordinates are those of a test field that was identified in pictures.
     """
 
     name: str
@@ -69,6 +71,7 @@ class Project:
     presets: Mapping[str, Camera] = field(default_factory=dict)
     lines: LinePositions | None = None
     check_points: CheckPoints | None = None
+    of_pictures: bool = False
 
     @property
     def folder(self) -> Path:
@@ -160,6 +163,7 @@ def _project(model: ProjectModel, reader: Reader, progress: Progress | None) -> 
     network = network_of(cameras, seen, known, bars=bars, per_image=model.per_image, scale_origin_px=model.scale_origin_px, unit=model.unit)
     findings = (*findings, *_unseen(known, points), *_without_images(network))
     about |= {"options": _options(model), "inputs": tuple(reader.files), "findings": findings, "check_points": checks}
+    about["of_pictures"] = model.pictures is not None
     return Project(network=network, **about)
 
 

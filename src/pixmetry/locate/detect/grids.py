@@ -14,6 +14,8 @@ FILL_TOLERANCE = 0.2  # the same for dots beyond a gap
 OUTLIER = 0.15  # of the pitch: farther from the homography through its neighbours, a dot is not on the grid
 AROUND = 12  # dots through which that homography is laid
 LARGEST_GAP = 3  # steps
+MOST_BESIDE = 0.2  # dots of something else that continue the grid of a plate, over those of the plate
+RIM_SHARE = 0.3  # of the dots of an outermost row or column, from which it is one
 LARGEST_INDEX = 1024  # rows or columns on one side of the first dot
 SEEDS = 6
 STEPS = np.array([(0, 1), (1, 0), (0, -1), (-1, 0)])  # (row, col)
@@ -66,7 +68,8 @@ def order_grid(x_px: np.ndarray, y_px: np.ndarray, *, pattern: tuple[int, int] |
     x_px, y_px : ndarray, shape (n,)
         Places, in any order; dots may be missing and others may lie between.
     pattern : (int, int), optional
-        Columns and rows of the whole plate, where they are known and all of it is seen: then the numbering is the one that fits.
+        Columns and rows of the whole plate, where they are known and all of it is seen: then the numbering is the one that fits, and the
+        message says why if none does. Dots of something else beside the plate, which happen to continue its grid, are left out.
     asymmetric : bool
         Every other row is shifted by half a step; row and column are counted as OpenCV does, ``x = 2 col + row % 2``.
 
@@ -87,6 +90,9 @@ def order_grid(x_px: np.ndarray, y_px: np.ndarray, *, pattern: tuple[int, int] |
     step being taken from the dots already placed, and the nearest dot within 0.3 steps of there is taken. Local steps bend with
     perspective and distortion, so nothing is assumed about either. Dots beyond a gap are placed by the homography through their
     12 nearest placed dots. Last, a dot that is more than 0.15 steps off the one through its own neighbours is an outlier.
+
+    The rows and columns at the rim of a plate of known size must be there: 0.3 of the dots of each, at least. So must the end of the plate:
+    a next row or column with 0.3 of its dots belongs to a larger plate, and no part of that is numbered.
     """
     x, y = np.asarray(x_px, float).ravel(), np.asarray(y_px, float).ravel()
     if x.shape != y.shape:
@@ -103,6 +109,21 @@ def order_grid(x_px: np.ndarray, y_px: np.ndarray, *, pattern: tuple[int, int] |
     row, col = nothing.row.copy(), nothing.col.copy()
     row[usable], col[usable] = index.T
     return Grid(x, y, row, col, *extent, message)
+
+
+def images_through(cells: np.ndarray, places: np.ndarray, asked: np.ndarray) -> np.ndarray:
+    """Images of the asked cells by the homography through some others."""
+    middle, size = places.mean(axis=0), places.std()
+    u, v = ((places - middle) / size).T
+    r, c = cells.T
+    one, none = np.ones(len(r)), np.zeros(len(r))
+    design = np.concatenate(
+        [np.stack([r, c, one, none, none, none, -u * r, -u * c], 1), np.stack([none, none, none, r, c, one, -v * r, -v * c], 1)]
+    )
+    h = np.append(np.linalg.lstsq(design, np.concatenate([u, v]), rcond=None)[0], 1.0).reshape(3, 3)
+    image = np.column_stack([asked, np.ones(len(asked))]) @ h.T
+    place: np.ndarray = image[:, :2] / image[:, 2:] * size + middle
+    return place
 
 
 def eight_bit(frame: np.ndarray) -> np.ndarray:
@@ -295,10 +316,11 @@ def _numbered(
     for change in plain:
         new = _from_zero(cells @ change.T, asymmetric)
         extent = _extent(new, asymmetric)
+        corner = None if pattern is None or asymmetric else _corner(new, pattern)
         image = np.linalg.solve(change.astype(float), np.eye(2)).T @ per_cell  # image step per new row and per new column
         if image[1, 0] * image[0, 1] - image[1, 1] * image[0, 0] <= 0:
             continue
-        fits = pattern is not None and extent == (pattern[1], pattern[0])
+        fits = corner is not None or (asymmetric and pattern is not None and extent == (pattern[1], pattern[0]))
         area = np.log((np.ptp(new, axis=0) + 1).prod())
         slant = np.log(np.hypot(*image[0]) * np.hypot(*image[1]) / abs(np.linalg.det(image)))
         # every row of an asymmetric plate has the same number of dots, which tells its top from its bottom if it has an odd number of rows
@@ -308,13 +330,43 @@ def _numbered(
         if rank is None or mark > rank:
             best, rank = change, mark
     cells = _from_zero(cells @ best.T, asymmetric)
-    rows, cols = _extent(cells, asymmetric)
+    corner = None if pattern is None or asymmetric else _corner(cells, pattern)
+    if pattern is not None and corner is not None:
+        cells = cells - corner
+        beside = (cells < 0).any(axis=1) | (cells >= (pattern[1], pattern[0])).any(axis=1)
+        cells[beside], rows, cols = -1, pattern[1], pattern[0]
+    else:
+        rows, cols = _extent(cells, asymmetric)
     if asymmetric:
         cells[:, 1] //= 2
     full = np.full(index.shape, -1)
     full[known] = cells
+    if pattern is not None and corner is None and not asymmetric and (cols, rows) == tuple(pattern):
+        return full, (rows, cols), f"a grid of {cols} × {rows}, but with an outermost row or column that is hardly there"
     wrong = pattern is not None and (cols, rows) != tuple(pattern)
     return full, (rows, cols), f"a grid of {cols} × {rows}, not {pattern[0]} × {pattern[1]}" if wrong and pattern else ""
+
+
+def _corner(cells: np.ndarray, pattern: tuple[int, int]) -> np.ndarray | None:
+    """Least row and column of a plate of a known size among the cells of its dots and of others; None where its rims are not sure."""
+    shape = np.array([pattern[1], pattern[0]])
+    extent = cells.max(axis=0) + 1
+    if (extent < shape).any():
+        return None
+    taken = np.zeros(extent + 2, int)  # one empty row and column around
+    np.add.at(taken, tuple(cells.T + 1), 1)
+    sums = np.pad(taken, ((1, 0), (1, 0))).cumsum(axis=0).cumsum(axis=1)
+    rows, cols = shape
+    inside = sums[rows:, cols:] - sums[:-rows, cols:] - sums[rows:, :-cols] + sums[:-rows, :-cols]
+    top, left = (1 + k for k in np.unravel_index(np.argmax(inside[1:-1, 1:-1]), inside[1:-1, 1:-1].shape))
+    here, across = slice(left, left + cols), slice(top, top + rows)
+    rims = [taken[top, here].sum(), taken[top + rows - 1, here].sum(), taken[across, left].sum(), taken[across, left + cols - 1].sum()]
+    beyond = [taken[top - 1, here].sum(), taken[top + rows, here].sum(), taken[across, left - 1].sum(), taken[across, left + cols].sum()]
+    whole = np.array([cols, cols, rows, rows])
+    within = inside[top, left]
+    alone = len(cells) - within <= MOST_BESIDE * within  # the dots of a plate that is counted along a diagonal leave a window of its size
+    sure = alone and (np.array(rims) >= RIM_SHARE * whole).all() and (np.array(beyond) < RIM_SHARE * whole).all()
+    return np.array([top, left]) - 1 if sure else None
 
 
 def _from_zero(cells: np.ndarray, asymmetric: bool) -> np.ndarray:

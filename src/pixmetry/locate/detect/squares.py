@@ -8,7 +8,7 @@ import numpy as np
 
 from pixmetry.core.errors import InputError
 from pixmetry.locate.detect.detection import Regions, detect
-from pixmetry.locate.detect.grids import Grid, no_grid, order_grid
+from pixmetry.locate.detect.grids import Grid, images_through, no_grid, order_grid
 from pixmetry.locate.detect.targets import Flag, Positions
 from pixmetry.locate.lines.line_candidates import LineCandidates
 from pixmetry.locate.lines.lines import PIXEL, line_positions
@@ -102,23 +102,8 @@ def expected_corners(grid: Grid, side: tuple[float, float]) -> np.ndarray:
     for row in range(grid.rows):
         for col in range(grid.cols):
             near = np.argsort(((cells - (row, col)) ** 2).sum(axis=1), kind="stable")[:AROUND]
-            corners[row, col] = _through(cells[near] - (row, col), places[near], (CORNERS - 0.5) * side[::-1])
+            corners[row, col] = images_through(cells[near] - (row, col), places[near], (CORNERS - 0.5) * side[::-1])
     return corners
-
-
-def _through(cells: np.ndarray, places: np.ndarray, asked: np.ndarray) -> np.ndarray:
-    """Images of the asked cells by the homography through some others."""
-    middle, size = places.mean(axis=0), places.std()
-    u, v = ((places - middle) / size).T
-    r, c = cells.T
-    one, none = np.ones(len(r)), np.zeros(len(r))
-    design = np.concatenate(
-        [np.stack([r, c, one, none, none, none, -u * r, -u * c], 1), np.stack([none, none, none, r, c, one, -v * r, -v * c], 1)]
-    )
-    h = np.append(np.linalg.lstsq(design, np.concatenate([u, v]), rcond=None)[0], 1.0).reshape(3, 3)
-    image = np.column_stack([asked, np.ones(len(asked))]) @ h.T
-    place: np.ndarray = image[:, :2] / image[:, 2:] * size + middle
-    return place
 
 
 def square_corners(

@@ -10,7 +10,7 @@ import numpy as np
 from pixmetry.core.errors import InputError
 from pixmetry.core.extras import import_extra
 from pixmetry.core.threads import map_tiles
-from pixmetry.locate.detect.grids import Grid, eight_bit, no_grid
+from pixmetry.locate.detect.grids import Grid, eight_bit, images_through, no_grid
 from pixmetry.locate.detect.targets import Flag, Positions
 from pixmetry.locate.noise import NoiseModel
 from pixmetry.locate.template import _corner_kernels as kernels
@@ -23,6 +23,9 @@ PLANES_SIGNIFICANT = 23.5  # fall of χ² with 4 unknowns more that noise alone 
 POOR_FIT_SIGMA = 6.0
 OUTSIDE_PX = 1e6  # where a start that is not a number is put
 LEAST_SQUARE_PX = 4
+SLIP_PX, SLIP_SQUARES = 2.0, 0.1
+SLIP_AROUND = 12
+LEAST_ALTERNATION = 0.5  # of the squares' colours, agreeing less disagreeing
 CHUNK = 64
 OTHER_STARTS_PX = ((0.8, 0.0), (-0.8, 0.0), (0.0, 0.8), (0.0, -0.8))
 
@@ -39,7 +42,7 @@ def find_chessboard(frame: np.ndarray, inner_corners: tuple[int, int]) -> Grid:
     Returns
     -------
     Grid
-        In the board's order, rows from 0 and columns from 0; empty with a message where no board of this size was seen.
+        Row by row, numbered as by `numbered_by_colours`; empty with a message where no board of this size was seen.
 
     Raises
     ------
@@ -66,9 +69,97 @@ def find_chessboard(frame: np.ndarray, inner_corners: tuple[int, int]) -> Grid:
         found, corners = cv2.findChessboardCorners(grey, (cols, rows), flags=flags)
     if not found:
         return no_grid(f"no chessboard of {cols} × {rows} inner corners was found", rows, cols)
-    place = np.asarray(corners, float).reshape(-1, 2)
+    place = without_slips(np.asarray(corners, float).reshape(rows, cols, 2)).reshape(-1, 2)
     row, col = np.divmod(np.arange(rows * cols), cols)
-    return Grid(place[:, 0], place[:, 1], row, col, rows, cols)
+    return numbered_by_colours(frame, Grid(place[:, 0], place[:, 1], row, col, rows, cols))
+
+
+def without_slips(place: np.ndarray) -> np.ndarray:
+    """Rough places of corners, shape (rows, cols, 2), each that is far from where its neighbours expect it put there.
+
+    The sector-based finder puts one corner in some thousands a third of a square away. A place counts as such a slip if it is off the
+    homography through the 12 corners around it by more than 2 px and 0.1 squares, and by more than any of these is.
+    """
+    rows, cols = place.shape[:2]
+    cells = np.stack(np.divmod(np.arange(rows * cols), cols), axis=1).astype(float)
+    out = place.reshape(-1, 2).copy()
+    near = np.argsort(((cells[:, None] - cells[None]) ** 2).sum(axis=2), axis=1, kind="stable")[:, 1 : SLIP_AROUND + 1]
+    steps = np.stack([np.hypot(*np.moveaxis(np.gradient(place, axis=axis), 2, 0)) for axis in (0, 1)])
+    limit = np.maximum(SLIP_PX, SLIP_SQUARES * steps.min(axis=0).ravel())
+    for _ in range(len(out)):
+        expected = np.array([images_through(cells[n] - cells[k], out[n], np.zeros((1, 2)))[0] for k, n in enumerate(near)])
+        off = np.hypot(*(out - expected).T) / limit
+        worst = (off > 1) & (off >= off[near].max(axis=1))
+        if not worst.any():
+            break
+        out[worst] = expected[worst]
+    return out.reshape(place.shape)
+
+
+def numbered_by_colours(frame: np.ndarray, grid: Grid) -> Grid:
+    """Number the corners of a whole chessboard so that the first square is dark.
+
+    Parameters
+    ----------
+    frame : ndarray, shape (rows, cols)
+    grid : Grid
+        A whole board, row by row, counted from any corner and in any sense.
+
+    Returns
+    -------
+    Grid
+        Row by row. Columns turn to rows as x does to y, and the square between the first four corners is dark. A board with the same
+        colours after a turn (`chessboard_turns`) is counted in that way in which its columns run most nearly towards x. Empty with a
+        message where the colours do not alternate.
+
+    Notes
+    -----
+    A square counts as dark or bright by the sign of its grey value less the mean of the squares beside it.
+    """
+    rows, cols = grid.rows, grid.cols
+    place = np.stack([grid.x_px, grid.y_px], axis=1).reshape(rows, cols, 2)
+    across, down = np.diff(place, axis=1).mean(axis=(0, 1)), np.diff(place, axis=0).mean(axis=(0, 1))
+    if across[0] * down[1] - across[1] * down[0] < 0:  # counted as in a mirror
+        place = place[:, ::-1]
+    turned = [np.rot90(place, k) for k in range(4)]
+    shaped = [board for board in turned if board.shape[:2] == (rows, cols)]
+    score = [float((square_colours(frame, board) * chessboard_colours(rows - 1, cols - 1)).mean()) for board in shaped]
+    if max(score) < LEAST_ALTERNATION:
+        return no_grid(f"the squares of what looks like {cols} × {rows} inner corners do not alternate between dark and bright", rows, cols)
+    steps = [np.diff(board, axis=1).mean(axis=(0, 1)) for board in shaped]
+    # towards x, or towards y where x leaves a tie
+    best = max(range(len(shaped)), key=lambda k: (score[k] > 0, round(steps[k][0] / np.hypot(*steps[k]), 6), steps[k][1]))
+    x, y = shaped[best].reshape(-1, 2).T
+    row, col = np.divmod(np.arange(rows * cols), cols)
+    return Grid(x.copy(), y.copy(), row, col, rows, cols)
+
+
+def square_colours(frame: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """Colours of the squares between inner corners, 1 dark, −1 bright; shape (rows − 1, cols − 1) for ``place`` of (rows, cols, 2)."""
+    middle = 0.25 * (place[:-1, :-1] + place[1:, :-1] + place[:-1, 1:] + place[1:, 1:])
+    x, y = np.rint(middle[..., 0]).astype(int), np.rint(middle[..., 1]).astype(int)
+    grey = frame[np.clip(y, 0, frame.shape[0] - 1), np.clip(x, 0, frame.shape[1] - 1)].astype(float)
+    beside = np.pad(grey, 1, constant_values=np.nan)
+    around = np.stack([beside[:-2, 1:-1], beside[2:, 1:-1], beside[1:-1, :-2], beside[1:-1, 2:]])
+    colours: np.ndarray = np.sign(np.nanmean(around, axis=0) - grey)
+    return colours
+
+
+def chessboard_colours(rows: int, cols: int) -> np.ndarray:
+    """Colours of rows × cols squares of which the first one is dark: 1 dark, −1 bright."""
+    return np.where(np.add.outer(np.arange(rows), np.arange(cols)) % 2 == 0, 1.0, -1.0)
+
+
+def chessboard_turns(rows: int, cols: int) -> tuple[int, ...]:
+    """Quarters of a turn after which a board of rows × cols inner corners looks the same.
+
+    Examples
+    --------
+    >>> chessboard_turns(6, 9), chessboard_turns(5, 7), chessboard_turns(6, 6), chessboard_turns(7, 7)
+    ((0,), (0, 2), (0, 1, 2, 3), (0, 2))
+    """
+    board = chessboard_colours(rows - 1, cols - 1)
+    return tuple(k for k in range(4) if np.array_equal(np.rot90(board, k), board))
 
 
 def chessboard_reach_px(grid: Grid, most_px: float = REACH_PX) -> np.ndarray:
