@@ -3,6 +3,7 @@ PYTHON ?= python3
 JOBS ?= 2
 RUNS ?= 200
 FILES ?=
+ONLY ?=
 REPORT ?= pixmetry-report
 
 VENV := .venv
@@ -44,8 +45,8 @@ bench: $(INSTALLED)-test ## run the benchmarks
 mutants: $(INSTALLED)-test ## plant wrong factors, one at a time, and see whether the tests find them
 	@$(PY) scripts/mutants.py --jobs $(JOBS)
 
-handbook: $(INSTALLED)-all ## run the handbook's experiments and write docs/handbook
-	@$(PY) scripts/make_handbook.py
+handbook: $(INSTALLED)-all ## run the handbook's experiments and write docs/handbook (ONLY="PAGE ...": run some)
+	@$(PY) scripts/make_handbook.py $(ONLY)
 
 lint: $(INSTALLED)-dev ## check style and types
 	@$(PY) -m ruff check src tests benchmarks scripts docs

@@ -1,55 +1,123 @@
-"""All pages of the handbook, and the front page that lists them."""
+"""All pages of the handbook, the front page that lists them, and ``gallery.json`` with every item."""
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Collection
+from dataclasses import dataclass
 from pathlib import Path
 
 from gallery import error_table_page, line_jitter_page, offset_page, threshold_page
+from gallery.item import KINDS, Item
+from gallery.note import Note, record_of, stored_numbers
 from gallery.page import Page, table
 
 INDEX = """# The handbook's experiments, repeated
 
-A handbook of camera calibration ([the handbook](../conventions.md)) shows in its chapter on image sensors, with simulated experiments, how
-a camera shifts the measured position of a target. These pages repeat the experiments, state all conditions, add pixmetry's estimators, and
-compare the numbers with those of the chapter.
+A handbook of camera calibration ([the handbook](../conventions.md)) shows in its chapter on image sensors, with experiments and numbers,
+how a camera shifts the measured position of a target. These pages repeat the experiments, state all conditions, add pixmetry's estimators,
+and compare the numbers with those of the chapter. Where the chapter contradicts itself, the page says so and shows the computation.
 
 {pages}
-`make handbook` writes these pages. The experiment on line jitter takes minutes; `benchmarks/study_line_jitter.py` runs it and stores its
-numbers. All numbers are the same in every run, because the random numbers are keyed. Positions and errors are in pixels. An error is
+All numbers are the same in every run, because the random numbers are keyed. Positions and errors are in pixels. An error is
 measured minus true. Grey values are those of 8 bits.
+
+## Every figure, table and number
+
+Kinds: {kinds}. A value agrees if it lies within the tolerance of the chapter's; its page tells why the others do not. {count}
+The same table, with the reasons, is in [gallery.json](gallery.json).
+
+{items}
+`make handbook` writes these pages; `make handbook ONLY="sampling-clock"` writes some of them. Most pages are a script of at most 60 lines,
+which stands on the page, and take less than a minute. The experiment on line jitter takes minutes; `benchmarks/study_line_jitter.py` runs
+it and stores its numbers.
 """
 
-EXPERIMENTS = (
-    ("Note 8, Fig 3.10", "threshold", "Thresholds", "why a hard threshold increases the error of a centroid, and what to use instead"),
-    (
-        "Note 13, Figs 3.13 to 3.17",
-        "offset",
-        "Black below zero",
+EXPERIMENTS = {  # pages with modules of their own: where in the chapter, title, what it shows
+    "threshold": (
+        threshold_page, "Note 8, Fig 3.10", "Thresholds", "why a hard threshold increases the error of a centroid, and what to use instead",
+    ),
+    "offset": (
+        offset_page, "Note 13, Figs 3.13 to 3.17", "Black below zero",
         "why lines have a periodic error when the converter cuts off values below black",
     ),
-    ("Note 19, Table 3.2", "line-jitter", "Line jitter", "whether the residuals of straight lines show the jitter of a frame grabber"),
-    (
-        "Tables 3.1 and 3.2",
-        "error-table",
-        "The error table",
+    "line-jitter": (
+        line_jitter_page, "Note 19, Table 3.2", "Line jitter", "whether the residuals of straight lines show the jitter of a frame grabber",
+    ),
+    "error-table": (
+        error_table_page, "Tables 3.1 and 3.2", "The error table",
         "the chapter's 39 rows for its own camera, and its residual after a calibration",
     ),
-)
+}  # fmt: skip
+NOTES = ("camera-data", "grabber-warm-up", "sampling-clock", "unflatness", "camera-warm-up", "charge-transfer")
+ORDER = (
+    "error-table", "camera-data", "grabber-warm-up", "sampling-clock", "threshold", "unflatness", "offset", "camera-warm-up",
+    "charge-transfer", "line-jitter",
+)  # as in the chapter  # fmt: skip
 
 
-def all_pages() -> list[Page]:
-    """Run every experiment; the front page comes first."""
-    rows = [[where, f"[{title}]({name}.md)", what] for where, name, title, what in EXPERIMENTS]
-    index = Page("index", INDEX.format(pages=table(["chapter", "page", "what it shows"], rows, 3)))
-    return [index, threshold_page.page(), offset_page.page(), line_jitter_page.page(), error_table_page.page()]
+@dataclass(frozen=True)
+class Gallery:
+    """All pages with their items.
+
+    Parameters
+    ----------
+    pages : dict of Page
+        By name; "index" is the front page.
+    items : tuple of Item
+    record : str
+        Text of ``gallery.json``.
+    """
+
+    pages: dict[str, Page]
+    items: tuple[Item, ...]
+    record: str
 
 
-def write(folder: Path) -> list[Path]:
-    """Write the pages and their figures into a folder; returns the files."""
+def make_gallery(run: Collection[str] = NOTES) -> Gallery:
+    """Make every page. Notes that are not to be run show their stored numbers and bring no figures."""
+    numbers, pages, rows, items = stored_numbers(), {}, [], []
+    for name in ORDER:
+        if name in EXPERIMENTS:
+            module, where, title, what = EXPERIMENTS[name]
+            pages[name] = module.page()
+        else:
+            note = Note.read(name)
+            numbers[name], pictures = note.run() if name in run or name not in numbers else (numbers[name], ())
+            pages[name] = note.page(numbers[name], pictures)
+            items += [(name, item) for item in note.items(numbers[name])]
+            where, title, what = (note.head[k] for k in ("chapter", "title", "shows"))
+        rows.append([where, f"[{title}]({name}.md)", what])
+    index = INDEX.format(
+        pages=table(["chapter", "page", "what it shows"], rows, 3),
+        kinds=", ".join(f"{k}: {v}" for k, v in KINDS.items()),
+        items=_summary(items),
+        count=_count([item for _, item in items]),
+    )
+    found = [item for _, item in items]
+    kept = {name: numbers[name] for name in NOTES}
+    return Gallery({"index": Page("index", index), **pages}, tuple(found), record_of(found, kept))
+
+
+def write(folder: Path, run: Collection[str] = NOTES) -> list[Path]:
+    """Write the pages, their figures and ``gallery.json`` into a folder; returns the files."""
     folder.mkdir(parents=True, exist_ok=True)
-    written = []
-    for page in all_pages():
-        for name, content in page.files().items():
-            (folder / name).write_text(content, encoding="utf-8")
-            written.append(folder / name)
-    return written
+    made = make_gallery(run)
+    files = {"gallery.json": made.record}
+    for page in made.pages.values():
+        files |= page.files()
+    for name, content in files.items():
+        (folder / name).write_text(content, encoding="utf-8")
+    return [folder / name for name in files]
+
+
+def _summary(items: list[tuple[str, Item]]) -> str:
+    rows = [[f"[{i.id}]({page}.md)", i.what, i.kind, *i.numbers, i.verdict_head] for page, i in items]
+    lines = table(["item", "quantity", "kind", "chapter", "ours", "u", "verdict"], rows, 3).split("\n")
+    return "\n".join([lines[0], "| --- | --- | --- | ---: | ---: | ---: | --- |", *lines[2:]])
+
+
+def _count(items: list[Item]) -> str:
+    counts = Counter(item.verdict_head for item in items)
+    agree, inconsistent, differ = (counts[head] for head in ("agree", "chapter inconsistent", "differs"))
+    return f"Of {len(items)} items {agree} agree, for {inconsistent} the chapter is inconsistent, and {differ} differ."

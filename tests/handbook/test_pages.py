@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import json
 import re
+import sys
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import pytest
+from gallery.item import Item
+from gallery.note import MOST_LINES, STORED, Note
 from gallery.page import Page, table
-from gallery.pages import all_pages
+from gallery.pages import NOTES, ORDER, Gallery, make_gallery
+
+from pixmetry.core.errors import InputError
 
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "handbook"
 NUMBER = re.compile(r"[−-]?\d+(?:\.\d+)?")
@@ -27,12 +33,20 @@ def differences(written: str, now: str) -> list[str]:
     return wrong
 
 
+QUICK = [name for name in NOTES if not Note.read(name).slow]  # the others show the numbers that they stored
+
+
 @pytest.fixture(scope="module")
-def pages() -> dict[str, Page]:
-    return {page.name: page for page in all_pages()}
+def gallery() -> Gallery:
+    return make_gallery(QUICK)
 
 
-@pytest.mark.parametrize("name", ["index", "threshold", "offset", "line-jitter", "error-table"])
+@pytest.fixture(scope="module")
+def pages(gallery: Gallery) -> dict[str, Page]:
+    return gallery.pages
+
+
+@pytest.mark.parametrize("name", ["index", *ORDER])
 def test_the_page_is_what_the_script_writes(name: str, pages: dict[str, Page]) -> None:
     wrong = differences((FOLDER / f"{name}.md").read_text(encoding="utf-8"), pages[name].text)
     assert not wrong, f"run make handbook: {wrong[:5]}"
@@ -43,16 +57,31 @@ def test_the_page_is_what_the_script_writes(name: str, pages: dict[str, Page]) -
         assert label is not None and not differences(label[1], re.search(r'aria-label="([^"]*)"', picture.svg)[1])
 
 
+def test_the_record_of_all_items_is_what_the_scripts_write(gallery: Gallery) -> None:
+    wrong = differences(STORED.read_text(encoding="utf-8"), gallery.record)
+    assert not wrong, f"run make handbook: {wrong[:5]}"
+    record = json.loads(gallery.record)
+    assert len({item["id"] for item in record["items"]}) == len(record["items"]) == len(gallery.items)
+
+
+@pytest.mark.parametrize("name", NOTES)
+def test_a_script_is_short_and_takes_only_what_a_user_has(name: str) -> None:
+    script = Note.read(name).script
+    assert len(script.splitlines()) <= MOST_LINES
+    imported = set(re.findall(r"^\s*(?:from|import) (\w+)", script, flags=re.M))
+    assert imported <= {"numpy", "pixmetry", "matplotlib", *sys.stdlib_module_names} and not re.search(r"pixmetry[\w.]*\._", script)
+
+
 def test_there_are_no_other_files(pages: dict[str, Page]) -> None:
-    wanted = {name for page in pages.values() for name in page.files()}
+    figures = {f"{figure}.svg" for name in NOTES for figure in Note.read(name).figures}
+    wanted = {name for page in pages.values() for name in page.files()} | figures | {STORED.name}
     assert {path.name for path in FOLDER.iterdir()} == wanted
 
 
 def test_figures_stand_alone_and_hold_no_date(pages: dict[str, Page]) -> None:
-    for page in pages.values():
-        for name, content in page.files().items():
-            if not name.endswith(".svg"):
-                continue
+    made = [content for page in pages.values() for name, content in page.files().items() if name.endswith(".svg")]
+    for group in (made, [path.read_text(encoding="utf-8") for path in FOLDER.glob("*.svg")]):
+        for content in group:
             root = ET.fromstring(content)
             assert root.tag == "{http://www.w3.org/2000/svg}svg" and int(root.get("width", 0)) > 300
             used = set(re.findall(r"var\(--(\w+)\)", content))
@@ -77,3 +106,23 @@ def test_planted_changes_are_seen() -> None:
     assert differences("it is 0.030 px", "it was 0.030 px")
     assert differences("800 targets", "801 targets")
     assert differences("−0.03 px", "0.03 px")
+
+
+@pytest.mark.parametrize(
+    ("ours", "otherwise", "verdict"),
+    [
+        (1.05, "", "agree"),
+        (1.2, "differs because it is another camera", "differs because it is another camera"),
+        (0.8, "chapter inconsistent: 2 - 1.2 = 0.8", "chapter inconsistent"),
+    ],
+)
+def test_a_verdict_follows_from_the_numbers(ours: float, otherwise: str, verdict: str) -> None:
+    assert Item.judged("N1", "ratio", "E", 1.0, ours, 0.1, otherwise=otherwise).verdict == verdict
+
+
+@pytest.mark.parametrize(
+    ("ours", "otherwise"), [(1.2, ""), (1.05, "differs because it is another camera"), (1.2, "because: so"), (float("nan"), "")]
+)
+def test_a_verdict_against_the_numbers_is_refused(ours: float, otherwise: str) -> None:
+    with pytest.raises(InputError):
+        Item.judged("N1", "ratio", "E", 1.0, ours, 0.1, otherwise=otherwise)
