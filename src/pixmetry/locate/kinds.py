@@ -13,6 +13,7 @@ from pixmetry.locate.estimator import Settings
 from pixmetry.locate.estimators import SPOTS, chosen_estimator, methods, seen_shape
 from pixmetry.locate.lines.line_candidates import LineCandidates
 from pixmetry.locate.noise import ROUNDING_DN2, NoiseModel
+from pixmetry.locate.noise_correlation import with_correlation
 from pixmetry.locate.records import LAST
 
 WITH_ARTICLE = {"disc": "a disc", "ellipse": "an ellipse", "ring": "a ring", "spot": "a spot"}
@@ -64,8 +65,11 @@ def locate_spots(task: Task) -> Measured:
     planes = False if task.kind == "coded" else task.planes  # the rings would pass for slopes
     settings = Settings(shape, planes, task.light_on, task.aperture_px, task.threads)
     positions = methods()[estimator].positions(task.frame, targets, noise, settings)
+    positions, wider = with_correlation(task.frame, found.targets, targets, positions, noise, shape, task.aperture_px)
     columns = _columns(positions, estimator if shape == task.kind else f"{estimator} ({shape})", noise)
     notes = _notes(estimator, reason, noise, found.polarity if len(targets) else "none found")
+    if wider != 1.0:
+        notes["noise_model"] += f"; neighbouring pixels share noise, u × {wider:.2f}"
     settled, whole = settled_ones(positions), np.ones(len(positions), bool)
     if task.kind == "coded":
         columns, whole = _coded(task, positions, columns)
