@@ -69,7 +69,7 @@ def test_records_hold_what_report_and_files_are_made_of(rng):
     expected = {
         "parameters", "vision", "correlations", "correlations_with_poses", "residuals", "f_test", "variance_components", "gross_errors",
         "hold_out", "patterns", "images", "curves", "projection", "network", "known", "parameter_groups", "residual_grid",
-        "field_sources",
+        "field_sources", "shared_errors", "halves", "jackknife",
     }  # fmt: skip
     assert expected == set(record_of(calibration.tests))
     assert words[0] == "checking the network" and words[-1] == "testing the result"

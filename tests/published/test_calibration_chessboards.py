@@ -6,6 +6,7 @@ Runs where the environment variable PIXMETRY_DATA names the folder that holds op
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -106,7 +107,8 @@ def test_opencv_corners_and_model_give_opencv_parameters_and_standard_deviations
     """Parameters within 1e-3 px (c, xp, yp; the others within what moves an image point by as much) and deviations within 1 %.
 
     ``calibrateCameraExtended`` scales the inverse of JᵀJ by the sum of squared residuals over (coordinates − unknowns), 1404 − 87 here,
-    as an a posteriori sigma0² does. (The rms it returns is per point, not per coordinate: √2 of the coordinates' rms.)
+    as an a posteriori sigma0² does: it takes errors as independent. On these pictures they are not (the last lines). (The rms it returns is
+    per point, not per coordinate: √2 of the coordinates' rms.)
     """
     places = [p.astype(np.float32) for p in opencv_corners()]
     objects = [board().astype(np.float32)] * len(places)
@@ -115,7 +117,7 @@ def test_opencv_corners_and_model_give_opencv_parameters_and_standard_deviations
     k1, k2, p1, p2, k3 = lens.ravel()[:5]
     theirs = dict(zip(OPENCV, (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], k1, k2, p1, p2, k3), strict=True))
 
-    adjustment = calibrate_network(opencv_network(), PLAIN).adjustment
+    adjustment = calibrate_network(opencv_network(), replace(PLAIN, shared_errors=False)).adjustment
     ours, u = as_opencv(adjustment)
     reach = np.hypot(*SIZE) / 2 / theirs["fx"]  # of a corner of the frame, as a tangent
     for name, power in zip(OPENCV, (0, 0, 0, 0, 3, 5, 2, 2, 7), strict=True):
@@ -125,6 +127,24 @@ def test_opencv_corners_and_model_give_opencv_parameters_and_standard_deviations
         assert u[name] == pytest.approx(float(deviation), rel=0.01), name
     assert np.sqrt(np.mean(np.sum(adjustment.residual_px**2, axis=1))) == pytest.approx(rms, rel=1e-6)
     assert adjustment.dof == 2 * 54 * 13 - 9 - 6 * 13
+
+    stated = calibrate_network(opencv_network(), PLAIN).adjustment
+    assert stated.shared is not None and stated.shared.found
+    np.testing.assert_array_equal(stated.state.interior, adjustment.state.interior)
+    independent = np.sqrt(np.diag(adjustment.interior_covariance()[1]))
+    np.testing.assert_allclose(stated.interior_u_independent(), independent, rtol=1e-9)
+    names, covariance = stated.interior_covariance()
+    wider = dict(zip(names, np.sqrt(np.diag(covariance)) / independent, strict=True))
+    assert all(wider[name] > 1.5 for name in ("c", "xp", "yp", "p1", "p2")), wider
+
+
+def test_halves_of_the_pictures_agree_within_the_stated_uncertainties() -> None:
+    """Every other picture, and the first half against the second: with uncertainties of independent errors F is 4.0 and 6.7 (p < 1e-4)."""
+    tests = calibrated().tests
+    (shared,), (halves,) = tests.shared_errors.values(), tests.halves.values()
+    assert shared.found and set(shared.kinds) == {"image", "frame", "view"}
+    for one in halves:
+        assert one.p > 0.05 and one.f < 2, (one.by, one.f)
 
 
 def test_corners_are_those_of_opencv_in_another_order() -> None:

@@ -72,10 +72,12 @@ def calibrated_geometry(
         calibration = read_calibration(calibration)
     if isinstance(calibration, Calibration):
         adjusted = calibration.adjustment
-        models, dof = tuple(adjusted.camera(k) for k in range(len(adjusted.network.cameras))), adjusted.dof
+        models = tuple(adjusted.camera(k) for k in range(len(adjusted.network.cameras)))
+        dofs = [adjusted.interior_dof(k) for k in range(len(models))]
         covariances = [adjusted.interior_covariance(k) for k in range(len(models))]
     else:
-        models, dof = calibration.cameras, calibration.dof
+        models = calibration.cameras
+        dofs = [calibration.interior_dof(k) for k in range(len(models))]
         covariances = [calibration.interior_covariance(k) for k in range(len(models))]
     names = [m.name for m in models]
     if camera is None and len(names) > 1 or camera is not None and camera not in names:
@@ -98,6 +100,7 @@ def calibrated_geometry(
             remedy = "calibrate with pitch_um, or state the pitch in the campaign"
             raise InputError("a calibration in pixels, and the pixel pitch is not known", where=model.name, remedy=remedy)
         model, covariance = with_pitch(model, estimated, covariance, pitch_um)
+    dof = float(np.min(dofs[k], initial=np.inf))  # one number for all: the least
     geometry = geometry_of(model, estimated, covariance, dof=dof, u_px=(u, u), left_px=left, origin=origin)
     told, untold = told_by_residuals(by_residuals, geometry, model) if by_residuals is not None else ({}, {})
     return replace(geometry, told=told, untold=untold)

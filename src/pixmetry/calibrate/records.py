@@ -272,6 +272,110 @@ class CameraResiduals:
 
 
 @dataclass(frozen=True)
+class SharedByCamera:
+    """Errors that the image points of a camera have in common, and the uncertainties of its parameters with and without them.
+
+    Parameters
+    ----------
+    kinds : tuple of str
+        Out of ``"image"`` (in one image), ``"frame"`` (at one place of the frame, in all images), ``"view"`` (in images from similar
+        directions).
+    rms_px, p : ndarray, shape (kinds,)
+        Of a coordinate; of an F-test against independent errors.
+    independent_px : float
+        rms of what is independent from point to point.
+    found : bool
+        Whether any is significant, and the uncertainties hold all of them.
+    names : tuple of str
+        Of the estimated parameters.
+    u, u_independent, dof : ndarray, shape (names,)
+        As stated; as if all errors were independent; effective degrees of freedom of the former.
+    """
+
+    kinds: tuple[str, ...]
+    rms_px: np.ndarray
+    p: np.ndarray
+    independent_px: float
+    found: bool
+    names: tuple[str, ...]
+    u: np.ndarray
+    u_independent: np.ndarray
+    dof: np.ndarray
+
+    @property
+    def widened(self) -> np.ndarray:
+        """Stated uncertainties over those of independent errors."""
+        return np.divide(self.u, self.u_independent, out=np.ones(len(self.u)), where=self.u_independent > 0)
+
+
+@dataclass(frozen=True)
+class Halves:
+    """A camera calibrated from two halves of the images.
+
+    Parameters
+    ----------
+    by : str
+        How they were divided, in words.
+    images : tuple of int
+        In each half.
+    names : tuple of str
+    difference, u : ndarray, shape (names,)
+        First half less the second; u holds what the halves do not share, with the variances that all images tell.
+    f, dof : float
+        Squared difference by its joint covariance, over the number of parameters; degrees of freedom of that covariance.
+    p : float
+        How often chance alone makes such a difference.
+    """
+
+    by: str
+    images: tuple[int, ...]
+    names: tuple[str, ...]
+    difference: np.ndarray
+    u: np.ndarray
+    f: float
+    dof: float
+    p: float
+
+    @property
+    def ratio(self) -> np.ndarray:
+        """Differences over their uncertainties."""
+        return np.divide(self.difference, self.u, out=np.zeros(len(self.u)), where=self.u > 0)
+
+    @property
+    def largest(self) -> tuple[str, float]:
+        """The parameter that differs most, and by how many u."""
+        k = int(np.argmax(np.abs(self.ratio)))
+        return self.names[k], float(abs(self.ratio[k]))
+
+
+@dataclass(frozen=True)
+class Jackknife:
+    """Parameters of a camera with each part of the images left out in turn.
+
+    Parameters
+    ----------
+    folds : int
+        Number of parts; one less are the degrees of freedom of
+    u : ndarray, shape (names,)
+        Standard uncertainties by the jackknife, which takes images as independent and nothing else: it is not told what all have in common.
+    names : tuple of str
+    stated : ndarray, shape (names,)
+        Standard uncertainties as stated.
+    """
+
+    folds: int
+    names: tuple[str, ...]
+    u: np.ndarray
+    stated: np.ndarray
+
+    @property
+    def ratio(self) -> float:
+        """rms over the parameters of the one over the other."""
+        some = self.stated > 0
+        return float(np.sqrt(np.mean((self.u[some] / self.stated[some]) ** 2))) if some.any() else 0.0
+
+
+@dataclass(frozen=True)
 class FTest:
     """One-sided F-test whether x is noisier than y.
 
@@ -1341,6 +1445,8 @@ class Tests:
         Of `Vision`, `Correlations`, `CameraResiduals`, `FTest`, `DistortionCurves`, `ProjectionMap`, `CameraComponents`, `ResidualGrid`.
     field_sources : mapping
         Of `FieldSources`.
+    shared_errors, halves, jackknife : mapping
+        Of `SharedByCamera`, of tuples of `Halves`, of `Jackknife`.
     correlations_with_poses : tuple of PoseCorrelation
     gross_errors : tuple of GrossError
         Largest statistic first.
@@ -1375,6 +1481,9 @@ class Tests:
     variance_components: Mapping[str, CameraComponents] | None = _if_made()
     eccentricity: EccentricityRecord | None = _if_made()
     residual_grid: Mapping[str, ResidualGrid] | None = _if_made()
+    shared_errors: Mapping[str, SharedByCamera] | None = _if_made()
+    halves: Mapping[str, tuple[Halves, ...]] | None = _if_made()
+    jackknife: Mapping[str, Jackknife] | None = _if_made()
     check_points: CheckRecord | None = _if_made()
     rig: RigRecord | None = _if_made()
 

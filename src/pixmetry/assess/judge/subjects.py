@@ -165,7 +165,9 @@ def _of_calibration(record: Mapping[str, Any], name: str, where: str) -> Subject
         for camera in cameras:
             channel = MONO if len(cameras) == 1 else str(camera["name"])
             for p in camera["parameters"]:
-                u, of_u = (_float(p["u"]), dof) if p["free"] else (0.0, math.inf)  # held fast: a number as it was given
+                u, of_u = 0.0, math.inf  # held fast: a number as it was given
+                if p["free"]:
+                    u, of_u = _float(p["u"]), _float(p.get("dof", dof))
                 values[channel, p["name"]] = Number(_float(p["value"]), u, of_u, p["unit"])
         return Subject(name, "calibration", "", _camera_facts(cameras), values, {})
     except (KeyError, IndexError, TypeError, AttributeError, ValueError):

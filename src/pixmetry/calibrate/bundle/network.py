@@ -183,6 +183,40 @@ class State:
 
 
 @dataclass(frozen=True)
+class SharedErrors:
+    """Errors that image points have in common, as the residuals of an adjustment show them (`pixmetry.calibrate.bundle.shared_errors`).
+
+    Parameters
+    ----------
+    kinds : tuple of (str, int)
+        ``"image"``, ``"frame"`` or ``"view"``, and the number of the camera; -1: of several cameras together.
+    rms_px : ndarray, shape (kinds,)
+        Of a coordinate over the image points.
+    p : ndarray, shape (kinds,)
+        Of an F-test against independent errors.
+    variance_px2 : ndarray, shape (kinds,)
+        Of the coefficients of each kind.
+    white_variance : float
+        Share of sigma0² (or of 1, a priori) that is left to independent errors.
+    u_independent : ndarray, shape (free columns,)
+        Standard uncertainties as if all errors were independent.
+    dof : ndarray, shape (free columns,)
+        Effective degrees of freedom of the stated uncertainties.
+    found : bool
+        Whether any kind is significant; else the covariances are those of independent errors.
+    """
+
+    kinds: tuple[tuple[str, int], ...]
+    rms_px: Array
+    p: Array
+    variance_px2: Array
+    white_variance: float
+    u_independent: Array
+    dof: Array
+    found: bool
+
+
+@dataclass(frozen=True)
 class Adjustment:
     """Result of one bundle adjustment.
 
@@ -218,6 +252,8 @@ class Adjustment:
     cost : tuple of float
         Weighted sum of squares of each iteration.
     notes : tuple of str
+    shared : SharedErrors, optional
+        Errors that image points have in common, and which the covariances hold then; None: not looked for.
     """
 
     network: Network
@@ -236,6 +272,7 @@ class Adjustment:
     iterations: int
     cost: tuple[float, ...]
     notes: tuple[str, ...] = ()
+    shared: SharedErrors | None = None
 
     def camera(self, index: int = 0) -> CameraModel:
         """The adjusted model of a camera."""
@@ -259,6 +296,19 @@ class Adjustment:
 
     def interior_covariance(self, index: int = 0) -> tuple[tuple[str, ...], Array]:
         """Names of the estimated parameters of a camera and their covariance."""
-        own = {f"{self.network.cameras[index].name}:{name}": name for name in NAMES}  # an image or a point may have the camera's name
-        rows = [i for i, name in enumerate(self.free_columns) if name in own]
-        return tuple(own[self.free_columns[i]] for i in rows), self.covariance[np.ix_(rows, rows)]
+        rows = self._interior_rows(index)
+        return tuple(self.free_columns[i].rpartition(":")[2] for i in rows), self.covariance[np.ix_(rows, rows)]
+
+    def interior_dof(self, index: int = 0) -> Array:
+        """Degrees of freedom of the uncertainties of these parameters."""
+        rows = self._interior_rows(index)
+        return np.full(len(rows), float(self.dof)) if self.shared is None else self.shared.dof[rows]
+
+    def interior_u_independent(self, index: int = 0) -> Array:
+        """Their standard uncertainties as if all errors of image coordinates were independent."""
+        rows = self._interior_rows(index)
+        return np.sqrt(np.diag(self.covariance)[rows]) if self.shared is None else self.shared.u_independent[rows]
+
+    def _interior_rows(self, index: int) -> list[int]:
+        own = {f"{self.network.cameras[index].name}:{name}" for name in NAMES}  # an image or a point may have the camera's name
+        return [i for i, name in enumerate(self.free_columns) if name in own]

@@ -49,6 +49,9 @@ class Options:
     a_priori : bool
         Take the covariance that the image coordinates came with as true: no variance components, and uncertainties are not scaled by
         sigma0.
+    shared_errors : bool
+        Look for errors that image points have in common, and let the uncertainties hold them where they are significant. Without it, all
+        errors are taken as independent.
     max_iterations : int
         Of one adjustment.
 
@@ -70,6 +73,7 @@ class Options:
     folds: int = 5
     residual_grid: bool = False
     a_priori: bool = False
+    shared_errors: bool = True
     max_iterations: int = 100
 
     def __post_init__(self) -> None:

@@ -10,6 +10,7 @@ from pixmetry.calibrate.bundle.model import NAMES
 from pixmetry.calibrate.bundle.network import PER_IMAGE_NAMES, Adjustment, Network, State
 from pixmetry.calibrate.bundle.options import Options
 from pixmetry.calibrate.bundle.settling import Progress, Settled, adjust_with, settle
+from pixmetry.calibrate.checks.hold_out import LeftOut
 from pixmetry.calibrate.records import Calibration, EccentricityRecord, FieldTest, HoldOut, Tests
 from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.finding import Finding
@@ -49,8 +50,10 @@ def calibrate_network(
     MeasureError
         If the network does not determine what was asked for.
     """
+    from pixmetry.calibrate.bundle.shared_errors import with_shared_errors
     from pixmetry.calibrate.checks.checks import check_network
     from pixmetry.calibrate.checks.findings import in_order
+    from pixmetry.calibrate.checks.parts import halves_of, jackknife_of
     from pixmetry.calibrate.checks.residual_grid import residual_grids
     from pixmetry.calibrate.start.posed_start import pose_findings
 
@@ -59,16 +62,19 @@ def calibrate_network(
     say("checking the network")
     findings = list(check_network(measured))
     settled = _from_start(measured, start, options, say)
-    settled, field, held, more = _checked_field(settled, options, say)
+    settled, field, held, left, more = _checked_field(settled, options, say)
     say("testing the result")
-    tests = replace(_tests(settled, network, options), field=field, hold_out=_with_expected(held, settled))
+    stated = with_shared_errors(settled.adjustment, a_priori=options.a_priori) if options.shared_errors else settled.adjustment
+    tests = replace(_tests(settled, stated, network, options), field=field, hold_out=_with_expected(held, settled))
+    if options.folds:
+        tests = replace(tests, halves=halves_of(stated) or None, jackknife=jackknife_of(stated, left) if left is not None else None)
     if field is None and options.field != "fixed" and not _is_free(settled.measured):
         tests = _without_claims(tests)
     if options.residual_grid:
         tests = replace(tests, residual_grid=residual_grids(settled.adjustment))
     findings += [*more, *_findings(settled, tests)]
     findings += _no_scale(network, settled.adjustment) + pose_findings(network, settled.adjustment.state)
-    return Calibration(settled.adjustment, in_order(findings), tests, tests.residual_grid or {}, {"options": asdict(options)})
+    return Calibration(stated, in_order(findings), tests, tests.residual_grid or {}, {"options": asdict(options)})
 
 
 def _no_scale(network: Network, adjustment: Adjustment) -> list[Finding]:
@@ -166,33 +172,33 @@ def _least_tilted(network: Network, state: State) -> str:
 
 def _checked_field(
     settled: Settled, options: Options, say: Progress
-) -> tuple[Settled, FieldTest | None, HoldOut | None, tuple[Finding, ...]]:
+) -> tuple[Settled, FieldTest | None, HoldOut | None, LeftOut | None, tuple[Finding, ...]]:
     """Fixed points against free ones, with images left out of the fit; without fixed points to test, only images left out."""
     from pixmetry.calibrate.checks.field_check import LEAST_FIELD, check_field
 
     if options.folds == 0:
-        return settled, None, None, ()
+        return settled, None, None, None, ()
     say("leaving images out of the fit")
     fixed = (settled.measured.u_xyz == 0).any(axis=1).sum()
     if options.field != "auto" or fixed < LEAST_FIELD:
-        return settled, None, _held_out(settled, options), ()
+        return settled, None, *_held_out(settled, options), ()
     check = check_field(settled.adjustment, options.folds)
     if check.verdict == "free":
         say("adjusting with the points of the field free")
         before = replace(settled, adjustment=check.adjustment)
         again = settle(_released(settled.measured), check.adjustment.state, options, say, before)
         settled = replace(again, known_faults=settled.known_faults + again.known_faults)
-    return settled, check.field, check.hold_out, check.findings
+    return settled, check.field, check.hold_out, check.left, check.findings
 
 
-def _held_out(settled: Settled, options: Options) -> HoldOut | None:
+def _held_out(settled: Settled, options: Options) -> tuple[HoldOut | None, LeftOut | None]:
     from pixmetry.calibrate.checks.hold_out import hold_out_record, left_out
 
     try:
         held = left_out(settled.adjustment, options.folds)
     except (InputError, MeasureError):
-        return None  # too few images to leave some out
-    return hold_out_record(None, held) if _is_free(settled.measured) else hold_out_record(held)
+        return None, None  # too few images to leave some out
+    return hold_out_record(None, held) if _is_free(settled.measured) else hold_out_record(held), held
 
 
 def _with_expected(record: HoldOut | None, settled: Settled) -> HoldOut | None:
@@ -212,11 +218,11 @@ def _is_free(network: Network) -> bool:
     return not (network.u_xyz == 0).any()
 
 
-def _tests(settled: Settled, given: Network, options: Options) -> Tests:
+def _tests(settled: Settled, stated: Adjustment, given: Network, options: Options) -> Tests:
     from pixmetry.calibrate.checks.tests import tests_of
 
     alpha, shift = options.false_alarms / len(settled.measured), settled.shift
-    tests = tests_of(settled.adjustment, given, alpha, settled.known_faults, settled.rejected, a_priori=options.a_priori)
+    tests = tests_of(settled.adjustment, given, alpha, settled.known_faults, settled.rejected, stated=stated, a_priori=options.a_priori)
     if shift.corrected.any() or shift.possible_px:
         tests = replace(tests, eccentricity=EccentricityRecord(int(shift.corrected.sum()), shift.largest_px, shift.possible_px))
     return replace(tests, variance_components=settled.components or None)

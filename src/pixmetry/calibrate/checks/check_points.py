@@ -237,6 +237,7 @@ def joint_covariance(adjustment: Adjustment, points: Ints, *, a_priori: bool = F
     from pixmetry.calibrate.bundle._bundle_kernels import ELIMINATED
     from pixmetry.calibrate.bundle.bundle_layout import layout_of
     from pixmetry.calibrate.bundle.bundle_system import Loss, condensed, equations, linearise, point_roots, rows_of
+    from pixmetry.calibrate.bundle.shared_errors import shared_moves
 
     layout = layout_of(adjustment.network, adjustment.state, adjustment.used)
     now = linearise(layout, adjustment.state, Loss())
@@ -253,9 +254,14 @@ def joint_covariance(adjustment: Adjustment, points: Ints, *, a_priori: bool = F
         else:  # joined by a bar
             slopes[i, range(3), layout.point_col[point] + np.arange(3)] = 1.0
     factor = 1.0 if a_priori else adjustment.sigma0**2
+    shared = adjustment.shared if adjustment.shared is not None and adjustment.shared.found else None
     rows = slopes.reshape(-1, m)[:, layout.estimated]
-    joint: Array = factor * own.reshape(len(rows), len(rows)) + rows @ adjustment.covariance @ rows.T
-    return joint
+    joint: Array = factor * own.reshape(len(rows), len(rows))
+    if shared is None:
+        return joint + rows @ adjustment.covariance @ rows.T
+    moved, by_points = shared_moves(adjustment, points)
+    independent = adjustment.covariance - moved @ moved.T
+    return shared.white_variance * joint + rows @ independent @ rows.T + by_points @ by_points.T
 
 
 def _text(found: CheckRecord) -> str:

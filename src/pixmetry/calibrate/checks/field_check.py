@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pixmetry.calibrate.bundle.network import Adjustment, Network
-from pixmetry.calibrate.checks.hold_out import hold_out_record, left_out
+from pixmetry.calibrate.checks.hold_out import LeftOut, hold_out_record, left_out
 from pixmetry.calibrate.checks.quality import p_words
 from pixmetry.calibrate.records import FieldComparison, FieldDeviations, FieldPoints, FieldTest, HoldOut, Moved
 from pixmetry.calibrate.start.fit_to_control import brought_to
@@ -36,6 +36,8 @@ class FieldCheck:
     hold_out : HoldOut or None
         None where free points could not be tried or judged.
     findings : tuple of Finding
+    left : LeftOut or None
+        Of the accepted one.
     """
 
     verdict: str
@@ -45,6 +47,7 @@ class FieldCheck:
     field: FieldTest
     hold_out: HoldOut | None
     findings: tuple[Finding, ...]
+    left: LeftOut | None = None
 
 
 def check_field(fixed: Adjustment, folds: int = 5, seed: int = 0, level: float = 0.01) -> FieldCheck:
@@ -96,7 +99,7 @@ def check_field(fixed: Adjustment, folds: int = 5, seed: int = 0, level: float =
     advice = "Keep the points free, or have the field measured." if better else ""
     kind = "flatness" if compared.deviations.shape == "plane" else "field"
     finding = Finding(kind, text, advice, "warning" if better else "note")
-    return FieldCheck(verdict, free if better else fixed, fixed, free, FieldTest(verdict, compared, text), held, (finding,))
+    return FieldCheck(verdict, free if better else fixed, fixed, free, FieldTest(verdict, compared, text), held, (finding,), parts[better])
 
 
 def _kept(fixed: Adjustment, text: str) -> FieldCheck:

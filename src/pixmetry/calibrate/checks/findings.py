@@ -12,6 +12,7 @@ from pixmetry.calibrate.bundle.eccentric import Eccentricity
 from pixmetry.calibrate.bundle.network import Adjustment, Network
 from pixmetry.calibrate.checks.hold_out import WORSE
 from pixmetry.calibrate.checks.known_checks import mostly_lost
+from pixmetry.calibrate.checks.parts import halves_findings, shared_findings
 from pixmetry.calibrate.checks.quality import p_words, plain
 from pixmetry.calibrate.records import (
     Contradicted,
@@ -34,7 +35,7 @@ ORDER = (  # of kinds, among findings of the same level; what is not named here 
     "misfit",
     "start", "determination", "images_left_out", "x_scale_drift", "bad_images", "images_rejected", "correlation", "flatness", "lost_points",
     "known_untested", "gross_scale_bar", "gross_control_point", "lost_control",
-    "x_shift", "field", "known_uncertainty", "eccentricity", "f_test", "gross_error", None,
+    "x_shift", "halves", "shared_errors", "field", "known_uncertainty", "eccentricity", "f_test", "gross_error", None,
     "two_rays", "significance", "variance_components", "residual_grid", "hold_out", "datum", "adjustment",
 )  # fmt: skip
 SIGNIFICANT = 0.05
@@ -73,6 +74,8 @@ def findings_of(adjustment: Adjustment, tests: Tests) -> list[Finding]:
         *f_test_findings(tests.f_test or {}),
         *gross_error_findings(tests.gross_errors or (), adjustment, images),
         *drift_findings(images, adjustment),
+        *halves_findings(tests.halves or {}),
+        *shared_findings(tests.shared_errors or {}),
         Finding("datum", f"Datum: {adjustment.datum}."),
     ]
     return found + [Finding("adjustment", note if note.endswith(".") else f"{note}.") for note in adjustment.notes]

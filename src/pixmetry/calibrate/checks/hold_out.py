@@ -31,12 +31,15 @@ class LeftOut:
         Residuals of the adjustment of all images; NaN: not used.
     image : ndarray of int, shape (n,)
     folds : int
+    interior : ndarray, shape (folds, cameras, 12), or None
+        Parameters found without each fold.
     """
 
     residual_px: np.ndarray
     fit_px: np.ndarray
     image: np.ndarray
     folds: int
+    interior: np.ndarray | None = None
 
 
 def left_out(adjustment: Adjustment, folds: int = 5, seed: int = 0) -> LeftOut:
@@ -67,15 +70,17 @@ def left_out(adjustment: Adjustment, folds: int = 5, seed: int = 0) -> LeftOut:
     network, used = adjustment.network, adjustment.used
     fold_of, folds = _dealt(network, folds, seed)
     residual = np.full((len(network), 2), np.nan)
+    interior = []
     for fold in range(folds):
         rest = fold_of != fold
         part, start, kept = subset(network, adjustment.state, rest)
         without = adjust(part, start, used=used[kept], covariance=False).state
+        interior.append(without.interior)
         state = replace(adjustment.state, interior=without.interior, xyz=without.xyz)
         mine = used & (fold_of[network.image] == fold)
         residual[mine] = resect(network, state, mine)[1][mine]
     fit = np.where(used[:, None], adjustment.residual_px, np.nan)
-    return LeftOut(residual, fit, network.image, folds)
+    return LeftOut(residual, fit, network.image, folds, np.array(interior))
 
 
 def _dealt(network: Network, folds: int, seed: int) -> tuple[np.ndarray, int]:

@@ -17,6 +17,7 @@ from pixmetry.calibrate.records import (
     ImageRecord,
     ParameterTest,
     PoseCorrelation,
+    SharedByCamera,
     Strongest,
     Vision,
 )
@@ -35,11 +36,11 @@ def parameter_records(adjustment: Adjustment) -> tuple[ParameterTest, ...]:
     out = []
     for k, camera in enumerate(adjustment.network.cameras):
         names, covariance = adjustment.interior_covariance(k)
-        matrix = correlation_of(covariance)
+        matrix, dof = correlation_of(covariance), adjustment.interior_dof(k)
         for i, name in enumerate(names):
             place = NAMES.index(name)
             value, u = float(adjustment.state.interior[k, place]), float(np.sqrt(covariance[i, i]))
-            p_zero = float(2 * stats.t.sf(abs(value) / u, adjustment.dof)) if name in TESTED and u > 0 and adjustment.dof > 0 else None
+            p_zero = float(2 * stats.t.sf(abs(value) / u, dof[i])) if name in TESTED and u > 0 and dof[i] > 0 else None
             others = np.where(np.arange(len(names)) == i, 0.0, np.abs(matrix[i]))
             best = int(np.argmax(others))
             strongest = Strongest(names[best], float(matrix[i, best])) if len(names) > 1 else None
@@ -62,7 +63,7 @@ def group_records(adjustment: Adjustment) -> tuple[GroupTest, ...]:
             u = np.sqrt(np.diag(covariance)[rows])
             z = values / u
             f = float(z @ np.linalg.solve(covariance[np.ix_(rows, rows)] / np.outer(u, u), z)) / len(rows)
-            dof = (len(rows), adjustment.dof)
+            dof = (len(rows), round(float(np.mean(adjustment.interior_dof(k)[rows]))))
             out.append(GroupTest(camera.name, group, tuple(names[i] for i in rows), f, dof, float(stats.f.sf(f, *dof))))
     return tuple(out)
 
@@ -107,6 +108,26 @@ def pose_correlations(adjustment: Adjustment, most: int = 20) -> tuple[PoseCorre
                 strongest[i, str(kind)] = (float(np.clip(block[row, best], -1, 1)), poses[best])
     ranked = sorted(strongest.items(), key=lambda item: -abs(item[1][0]))[:most]
     return tuple(PoseCorrelation(adjustment.free_columns[i], adjustment.free_columns[j], r) for (i, _), (r, j) in ranked)
+
+
+def shared_records(adjustment: Adjustment) -> dict[str, SharedByCamera] | None:
+    """Errors that image points share, by camera; None where they were not looked for."""
+    shared, network, out = adjustment.shared, adjustment.network, {}
+    if shared is None:
+        return None
+    for k, camera in enumerate(network.cameras):
+        own = [i for i, (_, of) in enumerate(shared.kinds) if of in (k, -1)]
+        own = [i for i in own if shared.kinds[i][1] == k] or own
+        rows = adjustment.used & (network.camera_of[network.image] == k)
+        if not own or not rows.any():
+            continue
+        names, covariance = adjustment.interior_covariance(k)
+        independent = float(adjustment.sigma0 * np.sqrt(shared.white_variance * np.mean(network.covariance_px2[rows][:, [0, 2]])))
+        out[camera.name] = SharedByCamera(
+            tuple(shared.kinds[i][0] for i in own), shared.rms_px[own], shared.p[own], independent, shared.found, names,
+            np.sqrt(np.diag(covariance)), adjustment.interior_u_independent(k), adjustment.interior_dof(k),
+        )  # fmt: skip
+    return out
 
 
 def vision_records(adjustment: Adjustment) -> dict[str, Vision]:

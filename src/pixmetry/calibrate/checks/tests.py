@@ -33,7 +33,14 @@ SWAPPED = 0.1  # of the distance of two points: as near to the other's place, th
 
 
 def tests_of(
-    adjustment: Adjustment, given: Network, alpha: float, faults: KnownFaults, rejected: Rejected | None = None, *, a_priori: bool = False
+    adjustment: Adjustment,
+    given: Network,
+    alpha: float,
+    faults: KnownFaults,
+    rejected: Rejected | None = None,
+    *,
+    stated: Adjustment | None = None,
+    a_priori: bool = False,
 ) -> Tests:
     """The tests that follow from one adjustment alone (with redundancy numbers and covariance).
 
@@ -48,28 +55,32 @@ def tests_of(
         Bars and control points that were contradicted.
     rejected : Rejected, optional
         Why image points were rejected.
+    stated : Adjustment, optional
+        The same with the uncertainties that are stated, where these hold more than independent errors.
     a_priori : bool
         Whether the covariances of the adjustment are without sigma0².
     """
     from pixmetry.calibrate.bundle.bundle import adjust
 
+    stated = stated or adjustment
     oriented = dict(zip(adjustment.network.images, adjustment.state.posed, strict=True))
     gross = tuple(error for error in gross_error_records(adjustment, alpha, rejected) if oriented[error.image])
     searched = searched_without_bad_images(adjustment, adjust)
     return Tests(
-        parameters=quality.parameter_records(adjustment),
-        parameter_groups=quality.group_records(adjustment),
-        vision=quality.vision_records(adjustment),
-        correlations=quality.correlation_records(adjustment),
-        correlations_with_poses=quality.pose_correlations(adjustment),
+        parameters=quality.parameter_records(stated),
+        parameter_groups=quality.group_records(stated),
+        vision=quality.vision_records(stated),
+        correlations=quality.correlation_records(stated),
+        correlations_with_poses=quality.pose_correlations(stated),
         residuals=_with_noise(quality.residual_records(adjustment), adjustment, given),
         f_test=quality.f_test_records(adjustment),
         gross_errors=gross,
         patterns=searched.patterns,
         field_sources=searched.sources or None,
-        images=quality.image_records(adjustment, Counter(error.image for error in gross)),
-        curves=curves.distortion_curves(adjustment),
-        projection=curves.projection_maps(adjustment),
+        images=quality.image_records(stated, Counter(error.image for error in gross)),
+        curves=curves.distortion_curves(stated),
+        projection=curves.projection_maps(stated),
+        shared_errors=quality.shared_records(stated),
         network=network_record(adjustment, _stated(faults, "scale_bars"), a_priori=a_priori),
         rig=rig_record(adjustment),
         known=replace(known_record(adjustment, faults, a_priori=a_priori), fixed_points=fixed_record(adjustment, adjust)),

@@ -84,6 +84,11 @@ class StoredCalibration:
         rows = [i for i, column in enumerate(self.columns) if column in own]
         return tuple(own[self.columns[i]] for i in rows), self.covariance[np.ix_(rows, rows)]
 
+    def interior_dof(self, index: int = 0) -> np.ndarray:
+        """Degrees of freedom of their uncertainties."""
+        shared = (self.tests.shared_errors or {}).get(self.cameras[index].name)
+        return shared.dof if shared is not None else np.full(len(self.interior_covariance(index)[0]), float(self.dof))
+
 
 def calibration_json(calibration: Calibration, folder: str | Path = "", beside: Iterable[str] = ()) -> str:
     """All numbers of a calibration as strict JSON; the joint covariance is packed, see `unpacked`.
@@ -149,7 +154,12 @@ def _control_record(calibration: Calibration) -> dict[str, Any]:
 
 
 def _camera_record(calibration: Calibration, k: int) -> dict[str, Any]:
-    return camera_record(calibration.adjustment.camera(k), *calibration.adjustment.interior_covariance(k))
+    a = calibration.adjustment
+    record = camera_record(a.camera(k), *a.interior_covariance(k))
+    if a.shared is not None and a.shared.found:
+        dof = dict(zip(record["covariance"]["names"], a.interior_dof(k), strict=True))
+        record["parameters"] = [{**one, **({"dof": dof[one["name"]]} if one["name"] in dof else {})} for one in record["parameters"]]
+    return record
 
 
 def lines_json(calibration: LineCalibration, folder: str | Path = "", beside: Iterable[str] = ()) -> str:

@@ -14,10 +14,12 @@ from pixmetry.calibrate.page import tables
 from pixmetry.calibrate.page.sources import add_sources
 from pixmetry.calibrate.page.text import (
     DIRECTIONS,
+    halves_text,
     of_camera,
     p_text,
     projection_levels,
     residual_record,
+    shared_text,
     sigma0_text,
     symbol,
     typeset,
@@ -32,7 +34,15 @@ from pixmetry.report.provenance import provenance_section
 if TYPE_CHECKING:
     from pixmetry.calibrate.bundle.model import CameraModel
     from pixmetry.calibrate.page.figures import Residuals
-    from pixmetry.calibrate.records import Calibration, DistortionCurves, EccentricityRecord, FieldTest, HoldOut, RigRecord
+    from pixmetry.calibrate.records import (
+        Calibration,
+        DistortionCurves,
+        EccentricityRecord,
+        FieldTest,
+        HoldOut,
+        RigRecord,
+        SharedByCamera,
+    )
     from pixmetry.core.finding import Finding
 
 WORST_IMAGES = 6  # on each of the two sheets that are not folded
@@ -43,6 +53,15 @@ PARAMETERS = (
     "Value ± standard uncertainty u (k = 1, two significant digits). p is the probability of a value at least that far from 0 if it were "
     "0: a lens or affinity term with a large p is not significant. Pixel (0, 0) is the centre of the top-left pixel, x to the right, y "
     "down."
+)
+UNCERTAINTIES = (
+    "± u is stated; “independent” is what it would be if errors of image points were independent; “95 %” is half of an interval of that "
+    "coverage, by the effective degrees of freedom. Differences of halves are over their own uncertainty, which holds what the halves do "
+    "not share."
+)
+LEFT_OUT = (
+    "“Left out”: u by the jackknife, from the calibrations without each of {folds} parts of the images, over the u stated; it is rough, "
+    "and does not see what all images share."
 )
 RESIDUALS = (
     "Residuals are measured minus computed image coordinates. Degrees of freedom are sums of redundancy numbers: of each residual, the "
@@ -147,6 +166,8 @@ def _parameters(section: Section, calibration: Calibration, pictures: Sequence[M
         own.add_text("B2 and P2 are for y down. For y up both change their sign; the other terms keep theirs.", style="small soft")
         if not any(r["u"].startswith("±") for r in rows):
             own.add_text("The uncertainty of the parameters was not computed.", style="small")
+        if shared := of_camera(calibration.tests.shared_errors, model.name):
+            _uncertainties(own, calibration, shared, model.name)
         if groups := tables.groups(calibration.tests.parameter_groups or (), model.name):
             own.add(number_table("Joint tests", ["Together", "Terms", "F", "Degrees of freedom", "p against 0"], groups, 2))
         if vision := tables.vision(calibration, model.name):
@@ -163,6 +184,18 @@ def _parameters(section: Section, calibration: Calibration, pictures: Sequence[M
         rows_of = [(_full(r.a), _full(r.b), fixed(r.r, 2)) for r in poses]
         table = number_table("Correlations with poses", ["Interior parameter", "Pose", "r"], rows_of, 2)
         section.add_section("Strongest correlations with poses", table, fold=True)
+
+
+def _uncertainties(own: Section, calibration: Calibration, shared: SharedByCamera, name: str) -> None:
+    """What of u comes from errors that image points share; halves of the images, and parts left out, against u."""
+    halves, left = of_camera(calibration.tests.halves, name), of_camera(calibration.tests.jackknife, name)
+    part = own.add_section("Uncertainties against the images")
+    part.add_text(typeset(shared_text(shared)))
+    if halves:
+        part.add_text(typeset(halves_text(halves)))
+    heads, rows = tables.uncertainties(shared, halves or (), left)
+    part.add(number_table(f"Uncertainties of {name}", heads, rows))
+    part.add_text(UNCERTAINTIES + (f" {LEFT_OUT.format(folds=left.folds)}" if left else ""), style="small soft")
 
 
 def _parameter_table(rows: Sequence[Mapping[str, str]], label: str) -> Table:

@@ -34,10 +34,13 @@ if TYPE_CHECKING:
         FieldComparison,
         GrossError,
         GroupTest,
+        Halves,
         HoldOut,
         ImageRecord,
+        Jackknife,
         Pattern,
         RigRecord,
+        SharedByCamera,
     )
 
 MOST_POINTS = 20  # in the table of those that are known worst
@@ -176,6 +179,24 @@ def groups(records: Sequence[GroupTest], name: str) -> list[list[str]]:
         degrees = f"{r.dof[0]:.0f} and {r.dof[1]:.0f}"
         rows.append([r.group, ", ".join(symbol(n) for n in r.names), value(r.f), degrees, p_text(r.p)])
     return rows
+
+
+def uncertainties(shared: SharedByCamera, halves: Sequence[Halves], left: Jackknife | None) -> tuple[list[str], list[list[str]]]:
+    """Heads and rows: u of each parameter with and without errors that image points share, its 95 %, and what halves of the images and
+    parts left out say of it."""
+    from scipy import stats
+
+    heads = ["Parameter", "u / u independent", "Degrees of freedom", "95 %"]
+    heads += [f"{one.by}: difference / u" for one in halves] + (["left out: u / u"] if left else [])
+    rows = []
+    for i, name in enumerate(shared.names):
+        row = [symbol(name), fixed(shared.widened[i], 2), f"{shared.dof[i]:.0f}", f"± {stats.t.ppf(0.975, max(1.0, shared.dof[i])):.2f} u"]
+        row += [signed(one.ratio[one.names.index(name)], lambda r: fixed(r, 1)) if name in one.names else NONE for one in halves]
+        if left:
+            k = left.names.index(name)
+            row.append(fixed(left.u[k] / left.stated[k], 1) if left.stated[k] > 0 else NONE)
+        rows.append(row)
+    return heads, rows
 
 
 def hold_out(found: HoldOut | None) -> list[list[str]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
@@ -26,7 +26,16 @@ from pixmetry.report.numbers import (
 )
 
 if TYPE_CHECKING:
-    from pixmetry.calibrate.records import AxisComponent, Calibration, CameraComponents, CameraResiduals, ParameterTest, ProjectionMap
+    from pixmetry.calibrate.records import (
+        AxisComponent,
+        Calibration,
+        CameraComponents,
+        CameraResiduals,
+        Halves,
+        ParameterTest,
+        ProjectionMap,
+        SharedByCamera,
+    )
 
 T = TypeVar("T")
 COLUMNS = 100  # of the terminal
@@ -41,6 +50,7 @@ TITLES = {
     "p2": "Decentring",
     **{f"k{n}": "Radial" for n in range(1, 6)},
 }
+SHARED = {"image": "in one image", "frame": "at one place of the frame in all images", "view": "in images from similar directions"}
 DIRECTIONS = {
     "image_to_object": "corrects image coordinates (image to object, as in photogrammetry)",
     "object_to_image": "distorts ideal directions (object to image, as in computer vision)",
@@ -122,6 +132,29 @@ def worth(calibration: Calibration, camera: int) -> str:
         return text + "."
     places = f"{length_px(levels[0])}{NO_BREAK}px in the middle of the frame and {length_px(levels[1])}{NO_BREAK}px in its corners"
     return f"{text}; the image of a given direction has a standard uncertainty of {places}."
+
+
+def halves_text(halves: Sequence[Halves]) -> str:
+    """Halves of a camera's images, calibrated apart, in one sentence."""
+    parts = [f"{one.largest[1]:.1f} u ({symbol(one.largest[0])}; {one.by}; p {_equal(one.p)})" for one in halves]
+    return f"Two halves of the images, calibrated apart, differ at most by {' and by '.join(parts)}."
+
+
+def _equal(p: float) -> str:
+    text = p_text(p)
+    return text if text.startswith("<") else f"= {text}"
+
+
+def shared_text(shared: SharedByCamera) -> str:
+    """Whether errors of image points are independent, and what that does to u."""
+    if not shared.found:
+        return "The residuals show no errors that image points have in common: u is that of independent errors."
+    parts = [f"{size:.3f}{NO_BREAK}px {SHARED[kind]}" for kind, size in zip(shared.kinds, shared.rms_px, strict=True) if size >= 5e-4]
+    low, high = (f"{one:.1f}" for one in (shared.widened.min(), shared.widened.max()))
+    return (
+        f"Image points have errors in common: {', '.join(parts)}; {shared.independent_px:.3f}{NO_BREAK}px are independent. u holds them: "
+        f"it is {low} to {high} times that of independent errors."
+    )
 
 
 def sigma0_text(calibration: Calibration) -> str:
@@ -221,6 +254,8 @@ def summary_text(calibration: Calibration) -> str:
             lines.append(sentence(found.text))
         lines.append("")
         lines += _parameter_lines(calibration, k)
+        if halves := of_camera(calibration.tests.halves, model.name):
+            lines += ["", halves_text(halves)]
     for one in calibration.tests.rig.cameras if calibration.tests.rig is not None else ():
         apart = uncertain(one.baseline, one.u_baseline, net.unit)
         angle = uncertain(one.angle_deg, one.u_angle_deg, "°")

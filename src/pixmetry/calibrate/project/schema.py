@@ -220,6 +220,7 @@ class OptionsModel(Model):
     folds: Literal[0] | Annotated[int, Field(ge=2)] | None = None
     residual_grid: bool | None = None
     a_priori: bool | None = None
+    shared_errors: bool | None = None
     max_iterations: Annotated[int, Field(ge=1)] | None = None
 
 

@@ -1,0 +1,251 @@
+"""Errors that image points share: against dense algebra written out, and in simulated networks whose errors are correlated."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from calibrate.networks import disturbed, predicted, simulate
+from pixmetry.calibrate.bundle import shared_errors
+from pixmetry.calibrate.bundle.bundle import adjust
+from pixmetry.calibrate.bundle.network import SharedErrors
+from pixmetry.calibrate.bundle.shared_errors import (
+    effects_of,
+    interior_parts,
+    shared_moves,
+    system_of,
+    view_of,
+    with_shared_errors,
+)
+from pixmetry.calibrate.bundle.solve import Options, calibrate_network
+from pixmetry.calibrate.checks.check_points import joint_covariance
+from pixmetry.calibrate.checks.hold_out import subset
+from pixmetry.calibrate.checks.parts import halves_of
+from pixmetry.calibrate.records import Tests, read_record, record_of
+
+RATE = 1e-6
+
+
+def moved(simulated, shift):
+    """The network with other image coordinates."""
+    n = simulated.network
+    return replace(n, x_px=n.x_px + shift[:, 0], y_px=n.y_px + shift[:, 1])
+
+
+def places(network):
+    """Of image coordinates in the frame, −1 … 1."""
+    sensor = network.cameras[0].sensor
+    return 2 * (network.x_px / sensor.cols - 0.5), 2 * (network.y_px / sensor.rows - 0.5)
+
+
+def bent_by_image(rng, simulated, size_px):
+    """A quadratic displacement of its own in each image."""
+    n = simulated.network
+    x, y = places(n)
+    shapes = np.stack([np.ones_like(x), x, y, x**2, x * y, y**2], axis=1)
+    weights = size_px * rng.standard_normal((len(n.images), 6, 2))
+    return moved(simulated, np.einsum("nk,nka->na", shapes, weights[n.image]))
+
+
+def waves(rng, simulated, size_px):
+    """One smooth field over the frame, the same in all images."""
+    n = simulated.network
+    angle, phase = rng.uniform(0, 2 * np.pi, (2, 6))
+    along = 2 * np.pi / (0.6 * n.cameras[0].sensor.cols) * (np.outer(n.x_px, np.cos(angle)) + np.outer(n.y_px, np.sin(angle)))
+    return moved(simulated, size_px * np.sqrt(2 / 6) * np.sin(along + phase) @ rng.standard_normal((6, 2)))
+
+
+def dense(adjustment):
+    """Whitened Jacobian of all unknowns by difference quotients of the tests' own projection."""
+    network, state = adjustment.network, adjustment.state
+    columns, base = [], predicted(network, state)
+    free = np.flatnonzero(network.cameras[0].free)
+
+    def column(changed, step):
+        return ((predicted(network, changed) - base) / step / np.sqrt(network.covariance_px2[:, [0, 2]])).ravel()
+
+    from scipy.spatial.transform import Rotation
+
+    for k in free:
+        step = 1e-6 * max(abs(state.interior[0, k]), 1e-3)
+        interior = state.interior.copy()
+        interior[0, k] += step
+        columns.append(column(replace(state, interior=interior), step))
+    for i in range(len(network.images)):
+        for a in range(6):
+            rotation, position = state.rotation.copy(), state.position.copy()
+            step = 1e-7 if a < 3 else 1e-4
+            if a < 3:
+                rotation[i] = Rotation.from_rotvec(step * np.eye(3)[a]).as_matrix() @ rotation[i]
+            else:
+                position[i, a - 3] += step
+            columns.append(column(replace(state, rotation=rotation, position=position), step))
+    for j in range(len(network.points)):
+        for a in range(3):
+            xyz = state.xyz.copy()
+            xyz[j, a] += 1e-4
+            columns.append(column(replace(state, xyz=xyz), 1e-4))
+    return np.array(columns).T, len(free)
+
+
+def small(rng):
+    return simulate(rng, images=8, points=16, bars=0)
+
+
+def test_answers_are_those_of_dense_least_squares(rng):
+    """A = N⁻¹ Jᵀ F of interior parameters, and Fᵀ R F, against a pseudo-inverse of the whole design by difference quotients."""
+    simulated = small(rng)
+    found = adjust(simulated.network, disturbed(rng, simulated, 0.003))
+    system = system_of(found)
+    effects = effects_of(system.layout, system.now.weight > 0, view_of(found))
+    assert [effect.kind for effect in effects] == ["image", "frame", "view"]
+    J, free = dense(found)
+    back = np.empty(2 * len(found.network), int)  # rows of the layout are in another order
+    back[0::2], back[1::2] = 2 * system.layout.order, 2 * system.layout.order + 1
+    scale = np.linalg.norm(J, axis=0)
+    left, singular, right = np.linalg.svd(J / scale, full_matrices=False)
+    inverse = right[:-7].T @ (left[:, :-7] / singular[:-7]).T / scale[:, None]  # seven have no effect: the datum
+    for effect in effects:
+        F = np.empty((len(back), effect.columns.shape[1]))
+        F[back] = effect.columns.toarray()
+        right, step, points = system.answers(effect.columns)
+        expected = inverse @ F
+        size = np.abs(expected[:free]).max(axis=1, keepdims=True)
+        np.testing.assert_allclose(step[:free] / size, expected[:free] / size, rtol=0, atol=1e-3)
+        m = len(system.layout.columns)
+        left = F.T @ F - right[:m].T @ step - right[m:].T @ points.reshape(-1, F.shape[1])
+        np.testing.assert_allclose(left, F.T @ (F - J @ expected), rtol=0, atol=1e-3 * np.abs(left).max())
+
+
+def test_independent_errors_leave_the_covariance_as_it_is(rng):
+    """One network in a hundred may be found to have something in common; five of six would be with a probability below 1e-6."""
+    found = []
+    for _ in range(6):
+        simulated = simulate(rng, images=8, points=30)
+        one = adjust(simulated.network, disturbed(rng, simulated, 0.003))
+        again = with_shared_errors(one)
+        found.append(again.shared.found)
+        if not again.shared.found:
+            assert again.covariance is one.covariance and again.point_covariance is one.point_covariance
+            np.testing.assert_array_equal(again.interior_dof(), one.dof)
+    assert sum(found) <= 3  # 15 · 0.01⁴ and less: below 1e-6
+
+
+@pytest.mark.parametrize("kind", [bent_by_image, waves])
+def test_correlated_errors_are_covered(kind, rng):
+    """The interior parameters of networks of 10 images whose errors are correlated: |error| stays within the stated 99.9 % interval (t with
+    the stated degrees of freedom) in nine of ten cases at least, where independent errors would have it in less."""
+    inside, inside_independent, widened = [], [], []
+    for _ in range(4):
+        simulated = simulate(rng, images=10, points=40, look="convergent", bars=0)
+        network = kind(rng, simulated, 0.15)
+        found = with_shared_errors(adjust(network, disturbed(rng, simulated, 0.003)))
+        assert found.shared.found
+        names, C = found.interior_covariance()
+        off = np.abs((found.state.interior - simulated.truth.interior)[0, found.network.cameras[0].free])
+        u, dof, plain = np.sqrt(np.diag(C)), found.interior_dof(), found.interior_u_independent()
+        inside += list(off <= stats.t.ppf(0.9995, dof) * u)
+        inside_independent += list(off <= stats.norm.ppf(0.9995) * plain)
+        widened.append(np.median(u / plain))
+        assert (dof < found.dof).all() and len(names) == len(dof)
+    assert np.mean(inside) > 0.85
+    assert np.mean(inside_independent) < np.mean(inside)
+    assert np.median(widened) > 1.5
+
+
+def test_variances_are_those_that_were_simulated(rng):
+    """Quadratic displacements of 0.15 px a coefficient: their rms over the frame is found within what 30 images of 12 coefficients allow
+    (factor 2, six standard deviations), and the rest is the noise."""
+    simulated = simulate(rng, images=30, points=60, bars=0)
+    network = bent_by_image(rng, simulated, 0.15)
+    found = with_shared_errors(adjust(network, disturbed(rng, simulated, 0.003)))
+    x, y = places(simulated.network)
+    expected = 0.15 * np.sqrt(np.mean(1 + x**2 + y**2 + x**4 + (x * y) ** 2 + y**4))
+    kinds = dict(zip((kind for kind, _ in found.shared.kinds), found.shared.rms_px, strict=True))
+    assert expected / 2 < kinds["image"] < 2 * expected
+    noise = found.sigma0 * np.sqrt(found.shared.white_variance * found.network.covariance_px2[0, 0])
+    assert 0.8 * 0.04 < noise < 1.2 * 0.04
+
+
+def test_moves_make_up_the_covariance_that_was_added(rng):
+    """Reduced unknowns and points: stated covariance less the independent part is the product of the moves; joint covariances of points
+    have the single ones as their blocks."""
+    simulated = simulate(rng, images=10, points=25, known="partly")  # a third of the points hold the datum
+    network = bent_by_image(rng, simulated, 0.15)
+    before = adjust(network, disturbed(rng, simulated, 0.003))
+    found = with_shared_errors(before)
+    points = np.flatnonzero(np.isinf(network.u_xyz).all(axis=1) & np.isfinite(found.state.xyz).all(axis=1))[:8]
+    moves, of_points = shared_moves(found, points)
+    share = found.shared.white_variance
+    np.testing.assert_allclose(found.covariance, share * before.covariance + moves @ moves.T, rtol=1e-6, atol=1e-12)
+    joint = joint_covariance(found, points)
+    for i, j in enumerate(points):
+        block = slice(3 * i, 3 * i + 3)
+        np.testing.assert_allclose(joint[block, block], found.point_covariance[j], rtol=1e-3, atol=1e-6 * joint.max())
+    assert of_points.shape[0] == 24
+
+
+def test_many_images_are_estimated_from_some_and_widened_by_all(rng, monkeypatch):
+    """With a limit of 6 images the variances come from 6, and the covariance still holds the displacements of all 14."""
+    simulated = simulate(rng, images=14, points=30, bars=0)
+    one = adjust(bent_by_image(rng, simulated, 0.2), disturbed(rng, simulated, 0.003))
+    whole = with_shared_errors(one)
+    monkeypatch.setattr(shared_errors, "MOST_IMAGES", 6)
+    part = with_shared_errors(one)
+    assert part.shared.found
+    ratio = np.sqrt(np.diag(part.interior_covariance()[1]) / np.diag(whole.interior_covariance()[1]))
+    assert (ratio > 0.5).all() and (ratio < 2).all()  # six images of 14 alone would give less than a half
+
+
+def test_halves_and_parts_are_in_every_report(rng):
+    """Halves of independent images agree: p is uniform; below 1e-6 once in 5e5 such tests of two. They are read back as they were."""
+    simulated = simulate(rng, images=12, points=30)
+    tests = calibrate_network(simulated.network, Options(), simulated.truth).tests
+    (halves,), (left,) = tests.halves.values(), tests.jackknife.values()
+    assert [one.images for one in halves] == [(6, 6), (6, 6)]
+    assert all(one.p > RATE for one in halves)
+    assert left.folds == 5 and 0.1 < left.ratio < 5
+    again = read_record(Tests, record_of(tests))
+    np.testing.assert_array_equal(again.halves["camera"][0].u, halves[0].u)
+    assert again.jackknife["camera"].folds == 5 and again.shared_errors["camera"].kinds == tests.shared_errors["camera"].kinds
+
+
+def test_a_step_between_the_halves_is_seen(rng):
+    """A principal distance that changes by 0.2 % after the sixth of twelve images, as of a lens that was touched."""
+    simulated = simulate(rng, images=12, points=40, bars=0)
+    n = simulated.network
+    centre = simulated.truth.interior[0, 1:3]
+    away = np.stack([n.x_px, n.y_px], axis=1) - centre
+    network = moved(simulated, np.where((n.image < 6)[:, None], 0.002 * away, 0.0))
+    found = with_shared_errors(adjust(network, disturbed(rng, simulated, 0.003)))
+    every_other, in_order = halves_of(found)["camera"]
+    k = in_order.names.index("c")
+    c = simulated.truth.interior[0, 0]
+    assert abs(in_order.difference[k] / c - 0.002) < 0.0005  # u of the difference is 0.00002
+    assert abs(in_order.difference[k]) > 5 * abs(every_other.difference[k])
+
+
+def test_what_halves_share_cancels(rng):
+    """With the same images twice, frame and view displacements move both halves alike: nothing of them is in the difference."""
+    simulated = simulate(rng, images=10, points=30, bars=0)
+    found = with_shared_errors(adjust(waves(rng, simulated, 0.15), disturbed(rng, simulated, 0.003)))
+    assert found.shared.found
+    network, start, kept = subset(found.network, found.state, np.ones(10, bool))
+    part = adjust(network, start, used=found.used[kept])
+    own, common = interior_parts(part, found)
+    np.testing.assert_allclose(own + common @ common.T, found.interior_covariance()[1], rtol=0.02)  # bumps against their principal parts
+
+
+def test_too_few_images_for_halves(rng):
+    simulated = simulate(rng, images=5, points=40)
+    assert halves_of(with_shared_errors(adjust(simulated.network, disturbed(rng, simulated, 0.003)))) == {}
+
+
+def test_degrees_of_freedom_are_those_of_the_adjustment_without_a_search(rng):
+    simulated = simulate(rng, images=5, points=20)
+    one = adjust(simulated.network, disturbed(rng, simulated, 0.003))
+    assert one.shared is None and (one.interior_dof() == one.dof).all()
+    assert isinstance(with_shared_errors(one).shared, SharedErrors)
