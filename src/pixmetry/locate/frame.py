@@ -7,7 +7,8 @@ import numpy as np
 from pixmetry.core.errors import InputError
 from pixmetry.locate.noise import NoiseModel
 
-PILED = 10  # pixels in 4 of one value at the top of an image before it is asked whether they were cut off there
+NEAR_END = 0.01  # of a float image's range: values that lie so near to its end
+PILED = 10  # pixels in 4 of one value at the end of an image before it is asked whether they were cut off there
 
 
 def checked_frame(frame: np.ndarray, name: str = "frame") -> np.ndarray:
@@ -44,8 +45,9 @@ def checked_frame(frame: np.ndarray, name: str = "frame") -> np.ndarray:
 def scale_ends(frame: np.ndarray, bits: int | None, noise: NoiseModel | None) -> tuple[float, float]:
     """Tell at which grey values the scale ends: from the noise model, the bits, or the image itself.
 
-    Without bits, an integer image is taken to end at the greatest value of 8, 10, 12, 14 or 16 bits if it reaches it, or at its own
-    greatest value if far more pixels have this one than the few values below: they were cut off there.
+    Without bits, an integer image is taken to end at the greatest value of 8, 10, 12, 14 or 16 bits if it reaches it. Any image is taken to
+    end at its own greatest value if far more pixels have this one than values a little below: they were cut off there. A float image
+    without negative values begins at 0 if pixels have it.
 
     Raises
     ------
@@ -53,7 +55,11 @@ def scale_ends(frame: np.ndarray, bits: int | None, noise: NoiseModel | None) ->
         If there are no such bits, or the image has more.
     """
     if frame.dtype.kind == "f":
-        return (-np.inf, np.inf) if noise is None else (noise.low_dn, noise.high_dn)
+        if noise is not None:
+            return noise.low_dn, noise.high_dn
+        high, black = float(frame.max()), np.count_nonzero(frame[::2, ::2] == 0) >= PILED
+        low = 0.0 if frame.min() == 0 and black else -np.inf
+        return low, high if _cut_off_at(frame, high, NEAR_END * (high - float(frame.min()))) else np.inf
     if bits is not None:
         if bits not in range(1, 17):
             raise InputError("the bits of a value cannot be used", where="bits", value=bits, allowed="1 to 16")
@@ -64,17 +70,17 @@ def scale_ends(frame: np.ndarray, bits: int | None, noise: NoiseModel | None) ->
     if noise is not None and np.isfinite(noise.high_dn):
         return max(0.0, noise.low_dn), noise.high_dn
     top = int(frame.max())
-    if any(top == (1 << n) - 1 for n in (8, 10, 12, 14, 16)) or _cut_off_at(frame, top):
+    if any(top == (1 << n) - 1 for n in (8, 10, 12, 14, 16)) or _cut_off_at(frame, top, 3):
         return 0.0, float(top)
     return 0.0, float("inf")
 
 
-def _cut_off_at(frame: np.ndarray, top: int) -> bool:
-    """Whether far more pixels have the greatest value than the few values below it, in an image that has noise."""
+def _cut_off_at(frame: np.ndarray, top: float, near_dn: float) -> bool:
+    """Whether far more pixels have the greatest value than lie little below it, in an image that has noise."""
     part = frame[::2, ::2]
     piled = int(np.count_nonzero(part == top))
-    if piled < PILED or piled <= 3 * int(np.count_nonzero(part >= max(top - 3, 0))) - 3 * piled:
+    if piled < PILED or piled <= 3 * int(np.count_nonzero(part >= top - near_dn)) - 3 * piled:
         return False
-    usual = int(np.median(part[::4, ::4]))
+    usual = float(np.median(part[::4, ::4]))
     without_noise = usual > 0 and np.count_nonzero(part[::4, ::4] == usual) > 0.5 * part[::4, ::4].size
-    return top > int(part.min()) and not without_noise
+    return bool(top > part.min()) and not without_noise

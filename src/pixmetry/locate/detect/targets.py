@@ -19,9 +19,10 @@ class Flag(IntFlag):
     OVERLAPPING = 16  # touches another target
     GRADIENT = 32  # the light falls off across the target, significantly
     UNEVEN_BACKGROUND = 64  # the background slopes under the target, significantly
-    POOR_FIT = 128  # the residuals are larger than the noise
+    POOR_FIT = 128  # the residuals are larger than the noise; the covariance is that of the residuals
     NOT_CONVERGED = 256  # the fit did not come to rest, or far from knows the place; such targets are left out of tables
     FAINT = 512  # so little contrast that the covariance, which is of first order, is too small
+    DEFECT = 1024  # pixels that stand out alone (hot, dead, hit by a particle) were left out
 
     def words(self) -> str:
         """Names joined by ``|``, lower case; empty if there are none."""

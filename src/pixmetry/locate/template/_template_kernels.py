@@ -46,6 +46,7 @@ LEAST_BACKGROUND = 0.01  # electrons, where their likelihood is used: there are 
 LEAST_ELECTRONS = 1e-3  # below it a pixel is as good as dark
 MOST_ELECTRONS = 60.0  # of a reading, from which it is as good as a shifted Poisson number
 PER_E = 8.0  # entries of the efficiency per unit of log(electrons)
+MOST_LONE = 4  # pixels of a target that may be defective
 CORE = 0.96  # of the height, from which a pixel counts as inside the target
 LEAST_CORE = 5  # pixels there that tell a slope
 ROWS = 32  # of a target, at most, that are asked whether rows are shifted against each other
@@ -289,6 +290,8 @@ def cut_out(frame: NDArray[np.generic], about: About, noise: Noise, which: Ints,
                         break
                 if own:
                     value = frame[y, x]
+                    if value != value:  # a pixel that is known to be defective
+                        continue
                     data[k + c], mask[k + c] = value, 1.0
                     used += 1
                     top += value >= high
@@ -810,6 +813,48 @@ def held_back(
                         if used[a] == base + k or used[a] == base + 2 + k:
                             inside[0, w, k] += step[a] * (1.0 if used[a] < base + 2 else p[amplitude])
     return moved, slopes, inside
+
+
+@jit
+def lone_outliers(frame: NDArray[np.generic], model: Model, parameters: Array, which: Ints, about: About, limit: float) -> Ints:
+    """Pixels that stand out from a fitted target alone, rows of (target, row, column): the residual is more than ``limit`` standard
+    deviations, and more than twice those of the four neighbours on its side. Where there are more than `MOST_LONE`, it is the shape.
+    """
+    found, total = np.empty((MOST_LONE * len(which), 3), np.int64), 0
+    quality = np.empty((len(about.home), 10))
+    for w in range(len(which)):
+        i = which[w]
+        side = 2 * about.half[i] + 1
+        wide = (side + 7) // 8 * 8
+        data, mask = np.empty(side * wide, np.float32), np.empty(side * wide, np.float32)
+        cut_out(frame, about, model.noise, which[w : w + 1], Packed(np.zeros(1, np.int64), data, mask), quality)
+        row0, col0 = int(round(about.home[i, 1])) - about.half[i], int(round(about.home[i, 0])) - about.half[i]
+        p = parameters[i].copy()
+        p[0] -= col0
+        p[1] -= row0
+        images = mean_images(model.kind, p, side, side, model.aperture, model.surface)
+        weight, residual, kept = np.empty((side, wide)), np.empty((side, wide)), np.zeros((side, wide))
+        weigh(
+            Window(images, data.reshape(side, wide), mask.reshape(side, wide), weight, kept, residual), model.noise, np.empty(0), 0.0, 0.0
+        )
+        count = 0
+        for r in range(side):
+            for c in range(side):
+                own = residual[r, c]
+                if weight[r, c] * own * own <= limit * limit:
+                    continue
+                sign, beside = math.copysign(1.0, own), 0.0
+                for dr, dc in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+                    if 0 <= r + dr < side and 0 <= c + dc < side:
+                        beside = max(beside, sign * residual[r + dr, c + dc])
+                if 2.0 * beside < abs(own):
+                    count += 1
+                    if count <= MOST_LONE:
+                        found[total, 0], found[total, 1], found[total, 2] = i, row0 + r, col0 + c
+                        total += 1
+        if count > MOST_LONE:
+            total -= MOST_LONE
+    return found[:total]
 
 
 @jit

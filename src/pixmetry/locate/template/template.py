@@ -12,7 +12,7 @@ from pixmetry.locate.detect.targets import Flag, Positions, Targets
 from pixmetry.locate.estimator import Method, Settings
 from pixmetry.locate.noise import NoiseModel
 from pixmetry.locate.template.image_noise import noise_from_image
-from pixmetry.locate.template.template_fit import KINDS, Fitted, Windows, run_fit, with_second_start
+from pixmetry.locate.template.template_fit import KINDS, Fitted, Windows, run_fit, with_second_start, without_outliers
 
 __all__ = ["KINDS", "LIGHT_ON", "PARAMETERS", "PLANES", "choose_planes", "fit_template", "model", "noise_from_image"]
 
@@ -176,7 +176,8 @@ def fit_template(
                 continue
             sloped = run_fit(windows, again, start, ground, light, False, threads)
             result = result.put(again, sloped)
-    return _positions(kind, targets, result, on_ground, on_light)
+    result, lone = without_outliers(windows, result, on_ground, on_light, threads)
+    return _positions(kind, targets, result, windows.noise, (on_ground, on_light, lone))
 
 
 def choose_planes(
@@ -300,9 +301,12 @@ def _check_shape(kind: str, p: np.ndarray) -> None:
         raise InputError(f"this {kind} cannot be computed", value=names, allowed="sizes and blur above 0, an outline that encloses an area")
 
 
-def _positions(kind: str, targets: Targets, result: Fitted, on_ground: np.ndarray, on_light: np.ndarray) -> Positions:
+def _positions(kind: str, targets: Targets, result: Fitted, on_ground: np.ndarray, on_light: np.ndarray, lone: np.ndarray) -> Positions:
     names = (*PARAMETERS[kind], *PLANES)
-    p, u = result.parameters, np.sqrt(result.variance)
+    poor = result.chi2_per_dof > 1 + POOR_SIGMA * np.sqrt(2 / np.maximum(result.dof, 1))
+    jitter = noise.row_shift_px > 0 or noise.field_shift_px > 0  # which is in the covariance, and in the residuals
+    wider = np.where(poor & (not jitter), result.chi2_per_dof, 1.0)  # residuals that are larger than the noise count as noise
+    p, u = result.parameters, np.sqrt(result.variance * wider[:, None])
     more = {name: p[:, j] for j, name in enumerate(names) if j > 1 and not name.startswith("shape_")}
     more |= {f"u_{name}": u[:, j] for j, name in enumerate(names) if j > 1 and not name.startswith("shape_")}
     if kind == "ellipse":
@@ -310,7 +314,6 @@ def _positions(kind: str, targets: Targets, result: Fitted, on_ground: np.ndarra
         half, spread = 0.5 * (xx + yy), np.hypot(0.5 * (xx - yy), xy)
         more |= {"semi_major_px": half + spread, "semi_minor_px": half - spread, "angle_deg": np.rad2deg(0.5 * np.arctan2(2 * xy, xx - yy))}
     more |= {"chi2_per_dof": result.chi2_per_dof, "dof": result.dof, "steps": result.steps}
-    poor = result.chi2_per_dof > 1 + POOR_SIGMA * np.sqrt(2 / np.maximum(result.dof, 1))
     worst = np.sqrt(result.noise_var_px2)
     flags = targets.flags.astype(np.uint32)
     for flag, where in (
@@ -321,11 +324,12 @@ def _positions(kind: str, targets: Targets, result: Fitted, on_ground: np.ndarra
         (Flag.GRADIENT, on_light),
         (Flag.UNEVEN_BACKGROUND, on_ground),
         (Flag.POOR_FIT, poor),
+        (Flag.DEFECT, lone),
         (Flag.UNDER_SAMPLED, more["blur_px"] < SHARP_PX),
         (Flag.FAINT, worst > FAINT_SHARE * np.hypot(more["blur_px"], 0.29)),
     ):
         flags[where] |= np.uint32(flag)
-    var_x, cov_xy, var_y = result.covariance.T.copy()
+    var_x, cov_xy, var_y = (result.covariance * wider[:, None]).T.copy()
     return Positions(p[:, 0].copy(), p[:, 1].copy(), var_x, cov_xy, var_y, flags, more)
 
 

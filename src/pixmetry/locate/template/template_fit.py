@@ -19,6 +19,9 @@ REACH = 3.5  # standard deviations of the edge, the pixel included, up to which 
 NEAR = 3.2  # the same within which a pixel is a neighbour's
 SMALL_PX, SHARP_PX, FAR_TOO_LARGE = 2.5, 0.3, 2.0  # size, blur and χ² per degree of freedom of a second start
 BLUR = -7  # place of the blur among the parameters
+SUSPECT_SIGMA = 3.0  # by which χ² must exceed the usual for pixels to be looked at one by one
+LONE_SIGMA = 5.0  # residual of a pixel that stands out, in standard deviations
+MOST_LOST = 1.7  # times the variance that a target may have without them
 CHUNK = 64  # targets in one piece of work, at most
 GAUSSIAN_FROM_E = 3.0  # read noise in electrons from which a reading is taken as normal with the variance of its mean
 
@@ -192,6 +195,48 @@ def with_second_start(
     other = run_fit(windows, again, start, *options, threads)
     better = again[other.at_rest[again] & ~(result.at_rest[again] & (result.chi2_per_dof[again] <= other.chi2_per_dof[again]))]
     return result.put(better, other) if len(better) else result
+
+
+def without_outliers(
+    w: Windows, result: Fitted, on_ground: np.ndarray, on_light: np.ndarray, threads: int | None
+) -> tuple[Fitted, np.ndarray]:
+    """Fit targets again without pixels that stand out alone: hot and dead ones, hits of particles; and say which targets, shape (n,).
+
+    Only targets whose χ² chance brings once in a thousand are looked at. A fit is believed if χ² is then as usual, and the pixels were
+    not those that the place is known from.
+    """
+    usual = result.chi2_per_dof[result.at_rest]
+    scale = max(1.0, float(np.median(usual))) if len(usual) else 1.0
+    spread = np.sqrt(2 / np.maximum(result.dof, 1))
+    high = np.flatnonzero(result.at_rest & (result.chi2_per_dof > scale * (1 + SUSPECT_SIGMA * spread)))
+    none = np.zeros(len(on_ground), bool)
+    if not len(high):
+        return result, none
+
+    def piece(part: np.ndarray) -> np.ndarray:
+        return kernels.lone_outliers(w.frame, w.model, result.parameters, part, w.about, LONE_SIGMA * math.sqrt(scale))
+
+    pieces = np.array_split(high, max(1, len(high) // CHUNK))
+    lone = np.concatenate(map_tiles(piece, pieces, threads))
+    if not len(lone):
+        return result, none
+    frame = w.frame.astype(np.float32)
+    frame[lone[:, 1], lone[:, 2]] = np.nan
+    without, hit = replace(w, frame=frame), np.unique(lone[:, 0])
+    for ground in (False, True):
+        for light in (False, True):
+            again = hit[(on_ground[hit] == ground) & (on_light[hit] == light)]
+            if not len(again):
+                continue
+            other = run_fit(without, again, result.parameters, ground, light, False, threads)
+            better = (
+                other.at_rest[again]
+                & (other.chi2_per_dof[again] < scale * (1 + 2 * SUSPECT_SIGMA * spread[again]))
+                & (other.noise_var_px2[again] < MOST_LOST * result.noise_var_px2[again])
+            )
+            result = result.put(again[better], other)
+            none[again[better]] = True
+    return result, none
 
 
 @lru_cache(maxsize=8)
