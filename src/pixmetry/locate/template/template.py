@@ -301,7 +301,9 @@ def _check_shape(kind: str, p: np.ndarray) -> None:
         raise InputError(f"this {kind} cannot be computed", value=names, allowed="sizes and blur above 0, an outline that encloses an area")
 
 
-def _positions(kind: str, targets: Targets, result: Fitted, on_ground: np.ndarray, on_light: np.ndarray, lone: np.ndarray) -> Positions:
+def _positions(kind: str, targets: Targets, result: Fitted, noise: NoiseModel, marks: tuple[np.ndarray, ...]) -> Positions:
+    """The table of fits; ``marks``: which have planes of the background and of the light, and lost pixels that stand out."""
+    on_ground, on_light, lone = marks
     names = (*PARAMETERS[kind], *PLANES)
     poor = result.chi2_per_dof > 1 + POOR_SIGMA * np.sqrt(2 / np.maximum(result.dof, 1))
     jitter = noise.row_shift_px > 0 or noise.field_shift_px > 0  # which is in the covariance, and in the residuals
