@@ -20,6 +20,7 @@ _HOMES = {
     "Number": "pixmetry.core.number",
     "PixmetryError": "pixmetry.core.errors",
     "Signal": "pixmetry.camera.signal",
+    "Tracker": "pixmetry.locate.track.tracker",
     "add_source_file": "pixmetry.camera.catalogue",
     "assess": "pixmetry.assess.job",
     "bound": "pixmetry.locate.bound.bound",
@@ -51,6 +52,7 @@ __all__ = [
     "Number",
     "PixmetryError",
     "Signal",
+    "Tracker",
     "__version__",
     "add_source_file",
     "assess",
@@ -94,6 +96,7 @@ if TYPE_CHECKING:
     from pixmetry.files import Frames, campaign_of_arrays, load_campaign, read_frame
     from pixmetry.locate.bound.bound import bound
     from pixmetry.locate.job import locate
+    from pixmetry.locate.track.tracker import Tracker
     from pixmetry.series.job import series
     from pixmetry.simulate.chain import chain
     from pixmetry.simulate.job import simulate

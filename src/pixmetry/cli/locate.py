@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -19,10 +20,8 @@ KINDS = ("disc", "ellipse", "ring", "spot", "line", "edge", "cross", "chessboard
 @click.option("--kind", type=click.Choice(KINDS), default="disc", show_default=True, help="Kind of target or line.")
 @click.option(
     "--estimator",
-    default="auto",
-    show_default=True,
     metavar="NAME",
-    help="Estimator that measures the positions. 'list' shows all for this kind.",
+    help="Estimator that measures the positions. 'list' shows all for this kind. Default: auto; with --track soft_threshold.",
 )
 @click.option(
     "-o",
@@ -78,11 +77,20 @@ KINDS = ("disc", "ellipse", "ring", "spot", "line", "edge", "cross", "chessboard
 )
 @click.option("--channel", type=click.Choice(["red", "green", "blue"]), help="Channel to use of colour images.")
 @click.option("--raw", metavar="WxH:FORMAT", help="Layout of files without a header, e.g. 1920x1200:Mono12p (GenICam's names).")
+@click.option("--track", is_flag=True, help="Find targets in the first image only, and follow each of them through the others.")
+@click.option("--search", "search_px", type=float, metavar="PX", help="Of --track: how far from its expected place a target is looked for.")
+@click.option("--interval", "interval_s", type=float, metavar="S", help="Of --track: time from frame to frame.")
+@click.option(
+    "--statistics",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="Of --track: JSON file of each target's repeatability, stated uncertainty and drift, and of the Allan deviation.",
+)
 @click.option("--threads", type=click.IntRange(1), help="Number of threads. Default: one for each processor.")
 def locate(
     images: tuple[Path, ...],
     kind: str,
-    estimator: str,
+    estimator: str | None,
     output: Path | None,
     overlay: Path | None,
     polarity: str,
@@ -94,6 +102,10 @@ def locate(
     planes: str,
     channel: str | None,
     raw: str | None,
+    track: bool,
+    search_px: float | None,
+    interval_s: float | None,
+    statistics: Path | None,
     threads: int | None,
 ) -> None:
     """Measure the positions of targets or lines, with their covariance.
@@ -113,12 +125,29 @@ def locate(
         for name, text in estimators(kind).items():
             click.echo(f"{name:<24} {text}")
         return
+    estimator = estimator or ("soft_threshold" if track else "auto")
+    unused = [
+        name for name, value in (("--search", search_px), ("--interval", interval_s), ("--statistics", statistics)) if value is not None
+    ]
+    if unused and not track:
+        raise click.UsageError(f"{unused[0]} is an option of --track")
     if not images:
         raise click.UsageError("no image is named")
     set_threads(threads)
     if skipped := skipped_files(images, raw):
         named = ", ".join(skipped[:MOST_NAMED]) + (f" and {len(skipped) - MOST_NAMED} more" if len(skipped) > MOST_NAMED else "")
         echo(f"skipped, not named like an image: {named}", err=True)
+    if track:
+        for name, value, default in (
+            ("--overlay", overlay, None), ("--grid", grid, None), ("--aperture", aperture, 1.0), ("--light-on", light_on, "surface")
+        ):  # fmt: skip
+            if value != default:
+                raise click.UsageError(f"{name} is no option of --track")
+        _track(
+            images, output, statistics, kind=kind, estimator=estimator, polarity=polarity, noise=noise, bits=bits, channel=channel, raw=raw,
+            search_px=search_px, interval_s=interval_s, threads=threads,
+        )  # fmt: skip
+        return
     with shown_progress() as progress:
         table = locate_files(
             images,
@@ -153,3 +182,19 @@ def locate(
         where = table.images[0]["name"] if len(table.images) == 1 else f"any of {len(table.images)} images"
         echo(f"nothing found: no {kind} in {where}; to do: {NOT_FOUND}", err=True)
         raise click.exceptions.Exit(EXIT_NOTHING_FOUND)
+
+
+def _track(images: tuple[Path, ...], output: Path | None, statistics: Path | None, **options: Any) -> None:
+    """Follow targets, and say how well they repeat."""
+    from pixmetry.cli._progress import shown_progress
+    from pixmetry.locate.track.files import track_files
+
+    if output is None and statistics is None:
+        raise click.UsageError("--track needs a file for its results: -o table.csv, --statistics file.json, or both")
+    with shown_progress() as progress:
+        found = track_files(images, output, statistics=statistics, progress=progress, **options)
+    for line in found.summary():
+        echo(line)
+    for name, path in (("table", output), ("statistics", statistics)):
+        if path is not None:
+            echo(f"{name}: {path}")

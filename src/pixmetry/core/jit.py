@@ -86,7 +86,7 @@ class Kernel(Generic[P, R]):
         return self._dispatcher
 
     def __call__(self, *args: P.args, **named: P.kwargs) -> R:
-        plain = [_plain(value) if isinstance(value, (np.ndarray, tuple)) else value for value in args]
+        plain = args if _is_plain(args) else [_plain(value) for value in args]
         result: R = (self._dispatcher or self.dispatcher)(*plain, **{name: _plain(value) for name, value in named.items()})
         return result
 
@@ -135,12 +135,23 @@ class _Writable:
         self.__array_interface__ = interface | {"data": (interface["data"][0], False)}
 
 
+def _is_plain(value: tuple[Any, ...]) -> bool:
+    """Whether all arrays in a tuple, and in those in it, are as they are wanted; asked at every call, so it is to be quick."""
+    for member in value:
+        if isinstance(member, np.ndarray):
+            if not member.flags.carray:
+                return False
+        elif isinstance(member, tuple) and not _is_plain(member):
+            return False
+    return True
+
+
 def _plain(value: Any) -> Any:
     """Give every array of one dtype and rank the same Numba type, also within tuples: C-contiguous, without the read-only flag."""
     if isinstance(value, tuple):
-        members = [_plain(member) for member in value]
-        if all(new is old for new, old in zip(members, value, strict=True)):
+        if _is_plain(value):
             return value
+        members = [_plain(member) for member in value]
         return type(value)(*members) if hasattr(value, "_fields") else tuple(members)
     if not isinstance(value, np.ndarray):
         return value

@@ -20,7 +20,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from pixmetry.core.checksums import check_record, file_sha256, sealed
 from pixmetry.core.errors import InputError
@@ -173,6 +173,39 @@ def write_together(outputs: Sequence[Output], contents: Sequence[bytes], inputs:
         raise
 
 
+@contextmanager
+def streamed_file(output: Output, inputs: Iterable[Path] = ()) -> Iterator[BinaryIO]:
+    """Write a file bit by bit, so that it appears whole or not at all, however long it gets.
+
+    Yields
+    ------
+    binary file
+        To write into; it takes its place when the block ends well.
+
+    Raises
+    ------
+    InputError
+        As `check_files` does, or if the file cannot be written.
+    """
+    check_files([output], inputs)
+    step = _Step(Path(os.path.realpath(output.path)))
+    try:
+        if output.make_folder:
+            step.path.parent.mkdir(parents=True, exist_ok=True)
+        with step.partial.open("xb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        step.keep_earlier()
+        step.take_place()
+    except BaseException as problem:
+        step.undo()
+        if isinstance(problem, OSError):
+            raise _unwritable(output.path, problem, "file", "place") from None
+        raise
+    step.finish()
+
+
 def replace_file(path: Path, raw: bytes) -> None:
     """Write one file into a folder that is this run's own, so that it is never there in part."""
     step = _Step(path)
@@ -218,6 +251,10 @@ class _Step:
             file.write(raw)
             file.flush()
             os.fsync(file.fileno())
+        self.keep_earlier()
+
+    def keep_earlier(self) -> None:
+        """Keep the earlier file under a second name, once the new one is written."""
         if self.earlier:
             shutil.copymode(self.path, self.partial)
             try:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from pixmetry.core.errors import InputError
+from pixmetry.locate.detect.limits import Limits, detect_within
 from pixmetry.locate.detect.targets import Flag, LeftOut, Positions, Targets
 from pixmetry.locate.estimator import Settings
 from pixmetry.locate.estimators import SPOTS, chosen_estimator, methods, seen_shape
@@ -37,6 +39,7 @@ class Task:
     light_on: str
     threads: int | None
     planes: str | bool = "auto"
+    limits: Limits = Limits()
 
 
 class Measured(NamedTuple):
@@ -47,27 +50,58 @@ class Measured(NamedTuple):
     left_out: LeftOut = LeftOut.of()
 
 
-def locate_spots(task: Task) -> Measured:
-    """Targets that are regions: discs, ellipses, rings, spots, with or without a code, on a plate or not."""
+class Spots(NamedTuple):
+    """Targets that are regions, as they were detected in a frame, and what their measurement needs besides."""
+
+    targets: Targets
+    regions: Targets  # all that were seen, of any shape
+    noise: NoiseModel
+    seen: str  # shape of the template that suits them
+    why: str
+    polarity: str
+    left_out: LeftOut
+
+
+def find_spots(task: Task) -> Spots:
+    """Detect the targets of a frame that have the shape of the kind, and take the noise that is given, or that the frame shows."""
     from pixmetry.locate.detect.detection import detect, seen_at, select
 
-    found = detect(task.frame, polarity=task.polarity, high_dn=task.high_dn, low_dn=task.low_dn, threads=task.threads)
+    wanted = task.limits
+    look = partial(
+        detect,
+        polarity=task.polarity,
+        high_dn=task.high_dn,
+        low_dn=task.low_dn,
+        threshold_sigma=wanted.threshold_sigma,
+        threads=task.threads,
+    )
+    seen_ones, left_out, polarities = detect_within(task.frame, wanted, look)
     shape = "ellipse" if task.kind == "coded" else task.kind
-    fits = select(found.targets, shape)
-    targets = found.targets[fits]
-    left_out = LeftOut.joined([found.left_out, seen_at(found.targets[~fits], f"not the shape of {WITH_ARTICLE[shape]}")])
-    estimator, reason = task.estimator, "as was asked for"
+    fits = select(seen_ones, shape)
+    targets, others = wanted.wanted(seen_ones[fits], task.frame.shape)
+    left_out = LeftOut.joined([left_out, seen_at(seen_ones[~fits], f"not the shape of {WITH_ARTICLE[shape]}"), others])
     seen, why = seen_shape(shape, targets)
     noise = _noise_for(task, seen, targets)  # with the targets' own shape, whatever measures them: what it does not explain is noise
+    polarity = polarities.pop() if len(polarities) == 1 else "both"
+    return Spots(targets, seen_ones, noise, seen, why, polarity if len(targets) else "none found", left_out)
+
+
+def locate_spots(task: Task) -> Measured:
+    """Targets that are regions: discs, ellipses, rings, spots, with or without a code, on a plate or not."""
+    from pixmetry.locate.detect.detection import seen_at
+
+    targets, regions, noise, seen, why, polarity, left_out = find_spots(task)
+    shape = "ellipse" if task.kind == "coded" else task.kind
+    estimator, reason = task.estimator, "as was asked for"
     if estimator == "auto":
         shape = seen
         estimator, reason = chosen_estimator(targets, noise, why)
     planes = False if task.kind == "coded" else task.planes  # the rings would pass for slopes
     settings = Settings(shape, planes, task.light_on, task.aperture_px, task.threads)
     positions = methods()[estimator].positions(task.frame, targets, noise, settings)
-    positions, wider = with_correlation(task.frame, found.targets, targets, positions, noise, shape, task.aperture_px)
+    positions, wider = with_correlation(task.frame, regions, targets, positions, noise, shape, task.aperture_px)
     columns = _columns(positions, estimator if shape == task.kind else f"{estimator} ({shape})", noise)
-    notes = _notes(estimator, reason, noise, found.polarity if len(targets) else "none found")
+    notes = _notes(estimator, reason, noise, polarity)
     if wider != 1.0:
         notes["noise_model"] += f"; neighbouring pixels share noise, u × {wider:.2f}"
     settled, whole = settled_ones(positions), np.ones(len(positions), bool)

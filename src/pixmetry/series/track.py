@@ -13,9 +13,8 @@ from pixmetry.core.arrays import Array
 from pixmetry.core.errors import MeasureError
 from pixmetry.locate.detect.targets import Flag
 from pixmetry.locate.job import locate
+from pixmetry.locate.track.tracker import gates_px
 
-NEAR = 0.4  # of the distance to the nearest neighbour, within which a target is the same
-MOST_PX = 25.0  # beyond which it is another, however far its neighbours are
 USELESS = Flag.NOT_CONVERGED | Flag.BORDER
 
 
@@ -126,7 +125,7 @@ def blur_of(frames: Sequence[FrameTargets], positions_px: Array) -> Array:
 def near_pairs(known: Array, found: Array, gate: float | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Indices of places that are each other's nearest within a distance: by default 0.4 of that between neighbours, 25 px at most."""
     if gate is None:
-        gate = MOST_PX if len(known) < 2 else min(MOST_PX, NEAR * float(cKDTree(known).query(known, 2)[0][:, 1].min()))
+        gate = float(gates_px(known).min())
     there, back = cKDTree(found).query(known)[1], cKDTree(known).query(found)[1]
     near = np.linalg.norm(found[there] - known, axis=1) < gate
     one = np.flatnonzero(near & (back[there] == np.arange(len(known))))

@@ -12,7 +12,8 @@ from pixmetry.core.errors import InputError
 from pixmetry.core.threads import map_tiles, thread_count
 from pixmetry.locate._noise_kernels import Noise, variances_dn2
 from pixmetry.locate.centroids import _moment_kernels as k
-from pixmetry.locate.detect.targets import Flag, Positions, Targets
+from pixmetry.locate.centroids import _window_kernels as w
+from pixmetry.locate.detect.targets import Positions, Targets
 from pixmetry.locate.estimator import Method, Settings
 from pixmetry.locate.noise import NoiseModel
 
@@ -70,23 +71,25 @@ def moment_positions(frame: np.ndarray, targets: Targets, noise: NoiseModel, nam
         raise InputError("no such law of moments", value=name, allowed=", ".join(LAWS))
     law, n = LAWS[name], len(targets)
     work = prepare(frame, targets, noise, margin=MARGINS[name], threads=threads)
-    s_curve = np.sqrt(_phase_variance(work, law, threads))
-    if law in (k.SOFT, k.HARD) and frame.dtype.kind in "ui":
-        # between two grey values, so that rounding moves no pixel over the threshold
-        level, sign, threshold = (work.record[:, c] for c in (k.LEVEL, k.SIGN, k.THRESHOLD))
-        work.record[:, k.THRESHOLD] = np.abs(np.floor(level + sign * threshold) + 0.5 - level)
+    multiple, phase, excess = choose_thresholds(work, law, threads)
+    whole = frame.dtype.kind in "ui" and law in (k.SOFT, k.HARD)
+    w.set_thresholds(work.record, 0, n, multiple, excess, whole, work.noise)
     result, at_rest = np.full((n, 6), np.nan), np.zeros(n, bool)
     work.over(lambda a, b: k.moments(frame, work.record, a, b, law, work.noise, result, at_rest), threads)
-    return positions(work, targets, noise, result, at_rest, s_curve, law in (k.SOFT, k.HARD))
+    return positions(work, targets, noise, result, at_rest, np.sqrt(phase), law in (k.SOFT, k.HARD))
 
 
 class Prepared:
     """The input of the kernels for each target, and the common input."""
 
-    def __init__(self, record: np.ndarray, noise: Noise, flags: np.ndarray, usable: np.ndarray) -> None:
-        self.record, self.noise, self.flags, self.usable = record, noise, flags, usable
-        self.amplitude = np.zeros(len(record))
-        self.radius = self.blur = self.amplitude
+    def __init__(self, record: np.ndarray, noise: Noise, flags: np.ndarray, disc: np.ndarray) -> None:
+        self.record, self.noise, self.flags = record, noise, flags
+        self.radius, self.blur, self.usable = np.ascontiguousarray(disc.T)
+
+    @property
+    def amplitude(self) -> np.ndarray:
+        """Height over the background, DN, above 0."""
+        return self.record[:, k.AMPLITUDE]
 
     def over(self, function: Callable[[int, int], None], threads: int | None) -> None:
         """Call ``function(first, stop)`` for slices of the targets."""
@@ -110,39 +113,20 @@ def prepare(
     from pixmetry.locate.detect.detection import neighbours
 
     n = len(targets)
-    record = np.zeros((n, k.COLUMNS))
-    major, minor = np.maximum(targets.semi_major_px, 0.5), np.maximum(targets.semi_minor_px, 0.5)
-    # a rough blur of one small target may be off by half; the lens is common to all. At most that of a Gaussian spot of this width
-    common = 0.85 * np.median(targets.blur_px[np.isfinite(targets.blur_px)]) if np.isfinite(targets.blur_px).any() else 0.3
-    blur = np.clip(np.maximum(targets.blur_px, common), 0.3, np.maximum(minor / 1.1774, 0.3))
-    usable = np.isfinite(targets.x_px + targets.y_px + major + minor + blur + targets.amplitude_dn + targets.background_dn)
-    for column, values in (
-        (k.X, targets.x_px), (k.Y, targets.y_px), (k.MAJOR, major), (k.MINOR, minor), (k.ANGLE, np.deg2rad(targets.angle_deg)),
-        (k.REACH, 4 * blur), (k.AMPLITUDE, np.abs(targets.amplitude_dn)), (k.SIGN, np.sign(targets.amplitude_dn)),
-        (k.LEVEL, targets.background_dn), (k.SLOPE_X, targets.background_x_dn_per_px), (k.SLOPE_Y, targets.background_y_dn_per_px),
-    ):  # fmt: skip
-        record[:, column] = np.where(usable, values, 1.0)
-    wanted = margin * blur
-    inner = np.maximum(4 * blur, 1.0)
-    record[:, k.INNER], record[:, k.OUTER] = inner, inner + 5 + 0.5 * np.sqrt(major * minor)
+    record, disc, flags = np.zeros((n, k.COLUMNS)), np.zeros((n, 3)), targets.flags.astype(np.uint32)
+    w.lay_out(sizes_of(targets), margin, _shapes(), record, disc)
     start, index = neighbours(targets, 2 * record[:, k.OUTER], record[:, k.REACH])  # lights that touch the ring, and windows that meet
-    turn = record[:, k.ANGLE]
-    half_x, half_y = np.hypot(major * np.cos(turn), minor * np.sin(turn)), np.hypot(major * np.sin(turn), minor * np.cos(turn))
-    rows, cols = frame.shape
-    edge = 0.5 + np.minimum(
-        np.minimum(targets.x_px, cols - 1 - targets.x_px) - half_x, np.minimum(targets.y_px, rows - 1 - targets.y_px) - half_y
-    )
-    free = k.limit_margins(record, start, index)
-    flags = targets.flags.astype(np.uint32)
-    flags = flags | np.where(edge < 1.5 * blur, np.uint32(Flag.BORDER), np.uint32(0))
-    flags = flags | np.where(free < 1.5 * blur, np.uint32(Flag.OVERLAPPING), np.uint32(0))
-    record[:, k.MARGIN] = np.minimum(wanted, np.maximum(np.minimum(edge - rim_px, free), blur))
-    work = Prepared(record, noise.numbers(), flags, usable)
-    work.radius, work.blur, spread = equivalent_disc(np.sqrt(major * minor), blur)
-    work.amplitude = record[:, k.AMPLITUDE]
-    record[:, k.SPREAD] = np.maximum(spread, 0.5)
+    w.limit_windows(record, start, index, frame.shape[0], frame.shape[1], rim_px, flags)
+    work = Prepared(record, noise.numbers(), flags, disc)
     work.over(lambda a, b: k.fit_grounds(frame, record, a, b, start, index, work.noise), threads)
     return work
+
+
+def sizes_of(targets: Targets) -> np.ndarray:
+    """Sizes of targets as the kernels read them, shape (n, SIZES)."""
+    t = targets
+    columns = (t.x_px, t.y_px, t.semi_major_px, t.semi_minor_px, t.angle_deg, t.blur_px, t.amplitude_dn, t.background_dn)
+    return np.stack([*columns, t.background_x_dn_per_px, t.background_y_dn_per_px], axis=1).astype(float)
 
 
 def positions(
@@ -155,23 +139,16 @@ def positions(
     thresholded: bool = False,
 ) -> Positions:
     """Combine the results of the kernels; ``result``: x, y, var x, cov, var y, relative standard deviation of the weights' sum."""
-    record = work.record
-    lost = ~at_rest | ~work.usable
-    result[lost] = np.nan
-    flags = work.flags | np.where(lost, np.uint32(Flag.NOT_CONVERGED), np.uint32(0))
-    random = np.sqrt(0.5 * (result[:, 2] + result[:, 4]))
-    flags = flags | np.where(s_curve_px > random, np.uint32(Flag.UNDER_SAMPLED), np.uint32(0))
-    flags = flags | np.where(result[:, 5] > 0.1, np.uint32(Flag.FAINT), np.uint32(0))
+    record, flags = work.record, work.flags.copy()
+    w.conclude(result, at_rest, work.usable, s_curve_px, row_shift_variance(targets, noise), flags)
     more = {
         "amplitude_dn": targets.amplitude_dn, "background_dn": record[:, k.LEVEL].copy(), "semi_major_px": targets.semi_major_px,
         "semi_minor_px": targets.semi_minor_px, "angle_deg": targets.angle_deg, "blur_px": targets.blur_px, "s_curve_px": s_curve_px,
         "threshold_dn": record[:, k.THRESHOLD].copy() if thresholded else np.full(len(record), np.nan),
     }  # fmt: skip
-    phase = s_curve_px**2
-    along = phase + row_shift_variance(targets, noise)
     return Positions(
-        x_px=result[:, 0], y_px=result[:, 1], var_x_px2=result[:, 2] + along, cov_xy_px2=result[:, 3], var_y_px2=result[:, 4] + phase,
-        flags=flags, more=more,
+        x_px=result[:, 0], y_px=result[:, 1], var_x_px2=result[:, 2], cov_xy_px2=result[:, 3], var_y_px2=result[:, 4], flags=flags,
+        more=more,
     )  # fmt: skip
 
 
@@ -219,13 +196,14 @@ def class_means(of: np.ndarray, *columns: np.ndarray) -> np.ndarray:
     return np.stack([np.bincount(of, weights=c) / count for c in columns], axis=1)
 
 
-def _phase_variance(work: Prepared, law: int, threads: int | None) -> np.ndarray:
-    """Variance over the sub-pixel phase of each target in px²; writes thresholds and the excess of their noise into the record."""
+def choose_thresholds(work: Prepared, law: int, threads: int | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of each target the threshold in standard deviations of the background's noise, the variance over the sub-pixel phase in px², and the
+    excess of the threshold's noise; arrays of shape (n,)."""
     record, n = work.record, len(work.record)
     if n == 0:
-        return np.zeros(0)
+        return np.zeros(0), np.zeros(0), np.zeros(0)
     if law == k.CENTROID:
-        return _centroid_phase_variance(work.radius, work.blur)
+        return np.zeros(n), _centroid_phase_variance(work.radius, work.blur), np.zeros(n)
     deviation = np.sqrt(np.maximum(variances_dn2(record[:, k.LEVEL] - work.noise.black_dn, work.noise), 1e-12))
     of, _ = classes(work.radius, work.blur, work.amplitude / deviation)
     radius = np.minimum(work.radius, LARGEST_PX - 12)
@@ -236,10 +214,8 @@ def _phase_variance(work: Prepared, law: int, threads: int | None) -> np.ndarray
     multiples = MULTIPLES if law in (k.SOFT, k.HARD) else np.zeros(1)
     tables = _tables()
     run_slices(lambda a, b: k.best_thresholds(shape, a, b, law, multiples, work.noise, tables, out), len(shape), threads)
-    record[:, k.THRESHOLD] = np.minimum(out[of, 0] * deviation, 0.5 * work.amplitude)
-    record[:, k.EXCESS] = out[of, 2]
-    phase: np.ndarray = out[of, 1]
-    return phase
+    multiple, phase, excess = out[of].T.copy()
+    return multiple, phase, excess
 
 
 def _centroid_phase_variance(radius: np.ndarray, blur: np.ndarray) -> np.ndarray:
@@ -277,25 +253,20 @@ def equivalent_disc(half_height_px: np.ndarray, blur_px: np.ndarray) -> tuple[np
     That is the standard deviation of the Gaussian with the same half-flux diameter. Where the contour is narrower than that of the blur
     alone, the disc is a point and the blur follows from the contour.
     """
-    ratio, contour, window = _shape_table()
-    asked = half_height_px / blur_px
-    blur = np.where(asked < contour[0], half_height_px / contour[0], blur_px)
-    asked = np.maximum(asked, contour[0])
-    inside = asked <= contour[-1]
-    radius = np.where(inside, np.interp(asked, contour, ratio), asked) * blur
-    spread = np.where(inside, np.interp(asked, contour, window), asked / math.sqrt(2) / math.sqrt(2 * math.log(2))) * blur
-    return radius, blur, spread
+    half, blur = np.broadcast_arrays(np.asarray(half_height_px, float), np.asarray(blur_px, float))
+    radius, width, spread = w.discs_of(half, blur, _shapes())
+    return radius, width, spread
 
 
 def half_height_radius(radius_px: np.ndarray | float, blur_px: np.ndarray | float) -> np.ndarray:
     """Return the radius of the contour at half height of a disc that is blurred by a Gaussian: the inverse of `equivalent_disc`."""
-    ratio, contour, _ = _shape_table()
+    ratio, contour, _ = _shapes()
     asked = np.asarray(radius_px, float) / blur_px
     return np.where(asked <= ratio[-1], np.interp(asked, ratio, contour), asked) * blur_px
 
 
 @lru_cache(1)
-def _shape_table() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _shapes() -> w.Shapes:
     """For R/s of a blurred disc: radius at half height over s, and half-flux radius over s and √(2 ln 2)."""
     nodes, weights = np.polynomial.legendre.leggauss(24)
     ratio = np.geomspace(0.05, 30.0, 48)
@@ -308,7 +279,7 @@ def _shape_table() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         contour[i] = np.interp(-0.5 * profile[0], -profile, r)
         flux = np.cumsum(profile * r)
         window[i] = np.interp(0.5 * flux[-1], flux, r + step / 2)
-    return ratio, contour, window / math.sqrt(2 * math.log(2))
+    return w.Shapes(ratio, contour, window / math.sqrt(2 * math.log(2)))
 
 
 def reach_px(radius_px: float, edge_px: float) -> float:

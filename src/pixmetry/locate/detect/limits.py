@@ -1,0 +1,188 @@
+"""Where targets are looked for, and which are wanted: regions of a frame, a mask, given places, limits of size and contrast."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pixmetry.core.errors import InputError
+from pixmetry.locate.detect.detection import THRESHOLD_SIGMA, Regions, seen_at
+from pixmetry.locate.detect.targets import LeftOut
+
+SAME_PX = 1.0  # two regions of interest that overlap show one target at places that differ by less
+NEAR_PX = 3.0  # beyond a target's outline, at which a given place is still its
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Which targets of a frame are wanted; by default all.
+
+    Parameters
+    ----------
+    rois : sequence of (row, col, rows, cols), optional
+        Regions in which targets are looked for, first pixel and size. What their borders cut is left out.
+    mask : ndarray of bool, shape of the frame, optional
+        True where the centres of targets may be.
+    places_px : ndarray, shape (n, 2), optional
+        x and y of the wanted targets, roughly: within their outlines, or 3 px from them.
+    diameter_px : (float, float), optional
+        Least and greatest diameter at half height; of ellipses the geometric mean of the axes.
+    contrast_dn : (float, float), optional
+        Least and greatest height over the background, without sign.
+    threshold_sigma : float
+        Threshold of detection in standard deviations of the background's noise.
+
+    Raises
+    ------
+    InputError
+        If one of them cannot be used.
+    """
+
+    rois: Sequence[tuple[int, int, int, int]] | None = None
+    mask: np.ndarray | None = None
+    places_px: np.ndarray | None = None
+    diameter_px: tuple[float, float] | None = None
+    contrast_dn: tuple[float, float] | None = None
+    threshold_sigma: float = THRESHOLD_SIGMA
+
+    def __post_init__(self) -> None:
+        for name in ("diameter_px", "contrast_dn"):
+            pair = getattr(self, name)
+            if pair is not None and not (len(pair) == 2 and 0 <= pair[0] < pair[1]):
+                raise InputError("not a range", where=name, value=pair, allowed="least and greatest, 0 or more, such as (3, 40)")
+        if self.rois is not None and not len(self.rois):
+            raise InputError("no region to look in", where="rois", remedy="name one, or leave them out")
+        if not (np.isfinite(self.threshold_sigma) and self.threshold_sigma > 0):
+            raise InputError("a threshold that cannot be used", where="threshold_sigma", value=self.threshold_sigma, allowed="above 0")
+        if self.places_px is not None:
+            places = np.asarray(self.places_px, float)
+            if places.ndim != 2 or places.shape[1] != 2 or not len(places) or not np.isfinite(places).all():
+                raise InputError("not places", where="positions", value=places.shape, allowed="shape (n, 2): x and y of one target or more")
+
+    @property
+    def given(self) -> bool:
+        """Whether there are any."""
+        return self != Limits()
+
+    def boxes(self, shape: tuple[int, int]) -> list[tuple[int, int, int, int]]:
+        """The regions of interest as first row, stop row, first column, stop column; the whole frame if there are none.
+
+        Raises
+        ------
+        InputError
+            If one is not within a frame of this shape.
+        """
+        if self.rois is None:
+            return [(0, shape[0], 0, shape[1])]
+        boxes = []
+        for roi in self.rois:
+            try:
+                row, col, rows, cols = (int(v) for v in roi)
+            except (TypeError, ValueError):
+                row = col = rows = cols = -1
+            if min(row, col) < 0 or min(rows, cols) < 1 or row + rows > shape[0] or col + cols > shape[1]:
+                allowed = f"row, col, rows, cols within {shape[0]} × {shape[1]} pixels (rows × columns)"
+                raise InputError("a region that is not in the frame", where="rois", value=roi, allowed=allowed)
+            boxes.append((row, row + rows, col, col + cols))
+        return boxes
+
+    def wanted(self, targets: Regions, shape: tuple[int, int]) -> tuple[Regions, LeftOut]:
+        """The targets that are wanted, in the order of the given places where there are such, and why the others are not.
+
+        Raises
+        ------
+        InputError
+            If the mask has another shape than the frame.
+        """
+        left_out = []
+
+        def keep(good: np.ndarray, reason: str) -> None:
+            nonlocal targets
+            left_out.append(seen_at(targets[~good], reason))
+            targets = targets[good]
+
+        if self.mask is not None:
+            mask = np.asarray(self.mask)
+            if mask.shape != shape or mask.dtype.kind not in "bui":
+                raise InputError("a mask of another size", where="mask", value=mask.shape, allowed=f"{shape}, True where targets may be")
+            row, col = (np.clip(np.rint(v).astype(int), 0, side - 1) for v, side in zip((targets.y_px, targets.x_px), shape, strict=True))
+            keep(mask[row, col] != 0, "outside the mask")
+        if self.diameter_px is not None:
+            diameter = 2 * np.sqrt(targets.semi_major_px * targets.semi_minor_px)
+            keep((diameter >= self.diameter_px[0]) & (diameter <= self.diameter_px[1]), "smaller or larger than asked for")
+        if self.contrast_dn is not None:
+            height = np.abs(targets.amplitude_dn)
+            keep((height >= self.contrast_dn[0]) & (height <= self.contrast_dn[1]), "contrast lower or higher than asked for")
+        if self.places_px is not None:
+            at, missed = _at_places(targets, np.asarray(self.places_px, float))
+            left_out.append(seen_at(targets[np.setdiff1d(np.arange(len(targets)), at)], "not at a given place"))
+            left_out.append(LeftOut.of(missed[:, 0], missed[:, 1], "no target at a given place"))
+            targets = targets[at]
+        return targets, LeftOut.joined(left_out)
+
+
+def _at_places(targets: Regions, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Indices of the targets at given places, in their order, each target once; and the places where there is none."""
+    from scipy.spatial import cKDTree
+
+    if not len(targets):
+        return np.zeros(0, int), places
+    away, which = cKDTree(np.column_stack([targets.x_px, targets.y_px])).query(places)
+    good = away < targets.semi_major_px[which] + NEAR_PX
+    for i in np.flatnonzero(good):
+        same = good & (which == which[i])
+        good[same & (away > away[same].min())] = False
+    first = np.zeros(len(places), bool)
+    first[np.unique(np.where(good, which, -1), return_index=True)[1]] = True
+    good &= first
+    return which[good], places[~good]
+
+
+def detect_within(frame: np.ndarray, limits: Limits, look: Callable[[np.ndarray], Any]) -> tuple[Regions, LeftOut, set[str]]:
+    """Detect in each region of interest; places are those of the whole frame.
+
+    Parameters
+    ----------
+    frame : ndarray, shape (rows, cols)
+    limits : Limits
+    look : callable
+        From a part of the frame to a `Detection`.
+
+    Returns
+    -------
+    Regions
+        What the border of a region of interest cuts is not among them, nor is one twice.
+    LeftOut
+    set of str
+        Polarities that were found.
+    """
+    from dataclasses import fields, replace
+
+    parts, left_out, polarities = [], [], set()
+    for top, bottom, left, right in limits.boxes((frame.shape[0], frame.shape[1])):
+        whole = (bottom - top, right - left) == frame.shape
+        found = look(frame if whole else np.ascontiguousarray(frame[top:bottom, left:right]))
+        t = found.targets
+        polarities.add(found.polarity)
+        lost = replace(found.left_out, x_px=found.left_out.x_px + left, y_px=found.left_out.y_px + top)
+        t = replace(
+            t, x_px=t.x_px + left, y_px=t.y_px + top, row_first=t.row_first + top, row_stop=t.row_stop + top, col_first=t.col_first + left,
+            col_stop=t.col_stop + left,
+        )  # fmt: skip
+        if not whole:
+            near = (t.row_first - 2 < top) & (top > 0) | (t.row_stop + 2 > bottom) & (bottom < frame.shape[0])
+            near |= (t.col_first - 2 < left) & (left > 0) | (t.col_stop + 2 > right) & (right < frame.shape[1])
+            lost = LeftOut.joined([lost, seen_at(t[near], "cut by the border of a region of interest")])
+            t = t[~near]
+        parts.append(t)
+        left_out.append(lost)
+    targets = Regions(**{f.name: np.concatenate([getattr(t, f.name) for t in parts]) for f in fields(Regions)})
+    if len(parts) > 1 and len(targets) > 1:
+        from scipy.spatial import cKDTree
+
+        pairs = cKDTree(np.column_stack([targets.x_px, targets.y_px])).query_pairs(SAME_PX, output_type="ndarray")
+        targets = targets[np.setdiff1d(np.arange(len(targets)), pairs[:, 1])]
+    return targets, LeftOut.joined(left_out), polarities
