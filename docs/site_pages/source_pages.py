@@ -12,13 +12,12 @@ from pixmetry.budget.monte_carlo import helpers_of
 from pixmetry.budget.probe import Target, facts_of, perfect, put, scene_of
 from pixmetry.budget.set_ups import FLAT, SET_UPS, kind_of
 from pixmetry.camera.camera import Camera, load_camera
-from pixmetry.camera.catalogue import sources, to_record
+from pixmetry.camera.catalogue import STAGES, sources, to_record
 from pixmetry.camera.chain_order import Element
 from pixmetry.camera.source import STATED_FRAME, Source, bounds_text
 from pixmetry.core.errors import PixmetryError
 from pixmetry.scene.uniform import Uniform
 
-STAGES = ("scene", "optics", "sensor", "electronics", "transfer", "grabber", "storage", "processing")
 DIGITAL, ANALOGUE = "imx264_like", "pulnix_tm6cn_epix_512"
 SHAPE = (72, 96)  # of the frames in the figures
 SHOWN = 24  # rows and columns about the target
@@ -95,7 +94,7 @@ def _index(listed: list[Source]) -> str:
         "Each page has the equation, the parameters with their ranges, a figure, and what can be done with the source.",
         "",
     ]
-    for stage in dict.fromkeys([*STAGES, *(s.stage for s in listed)]):
+    for stage in STAGES:
         own = [s for s in listed if s.stage == stage]
         if own:
             lines += [f"## {stage.capitalize()}", "", "| source | stars | measured | corrected |", "|---|---|---|---|"]
