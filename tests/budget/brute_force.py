@@ -584,7 +584,7 @@ def verdict_of(table: Table, brute: BruteForce, element: Element, sigmas: float)
         state = table.setting.calibrated if source.gum_class == "G" else table.setting.camera
         less = table._difference(table._with_and_without(state, element, in_camera))[:, 0].reshape(brute.at.shape)
     if row.before is None:  # it says why
-        told = row.reason and (not row.reason.startswith(("not computed", "Monte Carlo")) or "needs whole sequences" in row.reason)
+        told = row.reason and not row.reason.startswith(("not computed", "Monte Carlo"))
         return Verdict(row, NOTHING, NOTHING, NOT_SEEN, () if told else ("reason",))
     seen = brute.of(element, less)
     wrong = []

@@ -23,6 +23,7 @@ from pixmetry.budget.setting import Setting
 from pixmetry.camera.camera import Camera, Element, pitch_values
 from pixmetry.camera.catalogue import get_source, sources
 from pixmetry.camera.contribution import UNSTEADY, Contribution
+from pixmetry.camera.frozen import has_steady_state
 from pixmetry.camera.observations import TAKEN_UP
 from pixmetry.camera.source import Source
 from pixmetry.core.errors import InputError, PixmetryError
@@ -412,6 +413,8 @@ class Table:
             return self._sampled_anew(row, element) if self._has_other_samples(element, in_camera) else row
         if source.propagate is None and (source.forward is None or source.essential and source.ideal is None):
             return replace(row, before=Parts(), after=Parts(), reason=source.reasons["propagate"])
+        if source.propagate is None and not has_steady_state(source, element.params):
+            return replace(row, reason=source.reasons["propagate"])
         try:
             if source.propagate is not None and not hangs_on_picture(source, self.setting.camera):
                 how = FORMULA

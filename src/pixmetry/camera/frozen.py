@@ -54,14 +54,21 @@ def _cut(frame: Signal, like: Signal) -> Signal:
     )
 
 
+def has_steady_state(source: Any, params: Any) -> bool:
+    """Whether the memory of a source is a number, or an image, that can settle; that of a coder of sequences is not."""
+    try:
+        np.asarray(None if source.start is None else source.start(params), float)
+    except TypeError:
+        return False
+    return True
+
+
 def settled_state(element: Link, signal: Signal, stream: Any, most: int = 400) -> Any:
     """Run a source with a memory over the same frame until its state no longer changes."""
     source: Any = element.source
+    if not has_steady_state(source, element.params):
+        raise InputError(f"{element.name} has no steady state", remedy="switch it off: it needs whole sequences")
     state = source.start(element.params)
-    try:
-        np.asarray(state, float)
-    except TypeError:
-        raise InputError(f"{element.name} has no steady state", remedy="switch it off: it needs whole sequences") from None
     for _ in range(most):
         _, following = source.forward(element.params, signal, stream, state)
         change = np.max(np.abs(np.asarray(following, float) - np.asarray(state, float)))
