@@ -38,7 +38,7 @@ def test_headings_are_in_order(opened: Any) -> None:
     depth = opened.evaluate("[...document.querySelectorAll('h1,h2,h3,h4,h5,h6')].map(e => +e.tagName[1])")
     assert depth[0] == 1
     assert depth.count(1) == 1
-    assert depth.count(2) == 8
+    assert depth.count(2) in (8, 9)  # with stacks, also what rows share
     assert all(b <= a + 1 for a, b in zip(depth, depth[1:], strict=False))
 
 
@@ -46,14 +46,14 @@ def test_figures_and_their_pictures_are_there(opened: Any) -> None:
     boxes = opened.evaluate(
         "[...document.querySelectorAll('svg.figure')].map(e => e.getBoundingClientRect()).map(box => [box.width, box.height])"
     )
-    assert len(boxes) in (6, 10)
+    assert len(boxes) in (6, 11)
     assert all(width > 250 and height > 120 for width, height in boxes)
     sizes = opened.evaluate(
         "Promise.all([...document.querySelectorAll('svg image')].map(e => new Promise(done => { const i = new Image(); "
         "i.onload = () => done(i.naturalWidth); i.onerror = () => done(0); i.src = e.href.baseVal })))"
     )
     assert all(size > 1 for size in sizes)
-    assert len(sizes) >= (2 if len(boxes) == 10 else 0)
+    assert len(sizes) >= (2 if len(boxes) == 11 else 0)
 
 
 def test_text_stands_out_from_its_ground(opened: Any) -> None:
