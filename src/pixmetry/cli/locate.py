@@ -77,6 +77,17 @@ KINDS = ("disc", "ellipse", "ring", "spot", "line", "edge", "cross", "chessboard
 )
 @click.option("--channel", type=click.Choice(["red", "green", "blue"]), help="Channel to use of colour images.")
 @click.option("--raw", metavar="WxH:FORMAT", help="Layout of files without a header, e.g. 1920x1200:Mono12p (GenICam's names).")
+@click.option("--roi", "rois", multiple=True, metavar="ROW,COL,ROWS,COLS", help="Region to look in: first pixel and size. May be repeated.")
+@click.option("--mask", type=click.Path(path_type=Path), metavar="IMAGE", help="Image that is not 0 where the centres of targets may be.")
+@click.option(
+    "--places",
+    type=click.Path(path_type=Path),
+    metavar="CSV",
+    help="Only targets at these places (x_px, y_px).",
+)
+@click.option("--diameter", metavar="LEAST,GREATEST", help="Only targets of this diameter at half height, px.")
+@click.option("--contrast", metavar="LEAST,GREATEST", help="Only targets of this height over the background, DN, bright or dark.")
+@click.option("--threshold", type=float, default=4.0, show_default=True, metavar="SIGMA", help="Threshold of detection over the noise.")
 @click.option("--track", is_flag=True, help="Find targets in the first image only, and follow each of them through the others.")
 @click.option("--search", "search_px", type=float, metavar="PX", help="Of --track: how far from its expected place a target is looked for.")
 @click.option("--interval", "interval_s", type=float, metavar="S", help="Of --track: time from frame to frame.")
@@ -102,6 +113,12 @@ def locate(
     planes: str,
     channel: str | None,
     raw: str | None,
+    rois: tuple[str, ...],
+    mask: Path | None,
+    places: Path | None,
+    diameter: str | None,
+    contrast: str | None,
+    threshold: float,
     track: bool,
     search_px: float | None,
     interval_s: float | None,
@@ -137,15 +154,18 @@ def locate(
     if skipped := skipped_files(images, raw):
         named = ", ".join(skipped[:MOST_NAMED]) + (f" and {len(skipped) - MOST_NAMED} more" if len(skipped) > MOST_NAMED else "")
         echo(f"skipped, not named like an image: {named}", err=True)
+    regions = [_numbers(roi, "--roi", 4) for roi in rois] or None
     if track:
         for name, value, default in (
-            ("--overlay", overlay, None), ("--grid", grid, None), ("--aperture", aperture, 1.0), ("--light-on", light_on, "surface")
+            ("--overlay", overlay, None), ("--grid", grid, None), ("--aperture", aperture, 1.0), ("--light-on", light_on, "surface"),
+            ("--mask", mask, None), ("--places", places, None), ("--diameter", diameter, None), ("--contrast", contrast, None),
+            ("--threshold", threshold, 4.0), ("--planes", planes, "auto"),
         ):  # fmt: skip
             if value != default:
                 raise click.UsageError(f"{name} is no option of --track")
         _track(
             images, output, statistics, kind=kind, estimator=estimator, polarity=polarity, noise=noise, bits=bits, channel=channel, raw=raw,
-            search_px=search_px, interval_s=interval_s, threads=threads,
+            search_px=search_px, interval_s=interval_s, threads=threads, rois=regions,
         )  # fmt: skip
         return
     with shown_progress() as progress:
@@ -165,6 +185,12 @@ def locate(
             channel=channel,
             raw=raw,
             progress=progress,
+            rois=regions,
+            mask=mask,
+            places_px=places,
+            diameter_px=None if diameter is None else _numbers(diameter, "--diameter", 2),
+            contrast_dn=None if contrast is None else _numbers(contrast, "--contrast", 2),
+            threshold_sigma=threshold,
         )
     if output is None:
         echo_lines(table.to_csv(), nl=False)
@@ -182,6 +208,17 @@ def locate(
         where = table.images[0]["name"] if len(table.images) == 1 else f"any of {len(table.images)} images"
         echo(f"nothing found: no {kind} in {where}; to do: {NOT_FOUND}", err=True)
         raise click.exceptions.Exit(EXIT_NOTHING_FOUND)
+
+
+def _numbers(text: str, option: str, count: int) -> tuple[Any, ...]:
+    """So many numbers with commas between them."""
+    try:
+        values = tuple(float(part) for part in text.split(","))
+    except ValueError:
+        values = ()
+    if len(values) != count:
+        raise click.BadParameter(f"{text!r} is not {count} numbers with commas between them", param_hint=option)
+    return values
 
 
 def _track(images: tuple[Path, ...], output: Path | None, statistics: Path | None, **options: Any) -> None:

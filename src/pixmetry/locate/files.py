@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -31,6 +32,8 @@ def locate_files(
     raw: str | RawLayout | None = None,
     progress: Progress | None = None,
     noise: NoiseModel | Camera | str | Path | None = None,
+    mask: np.ndarray | str | Path | None = None,
+    places_px: np.ndarray | str | Path | None = None,
     **options: Any,
 ) -> Located:
     """Locate targets in image files; one table for all, with a column ``image``.
@@ -51,6 +54,10 @@ def locate_files(
     progress : callable (what, done, of), optional
     noise, **options
         As in `locate`.
+    mask : ndarray or path, optional
+        As in `locate`, or an image that is not 0 where targets may be.
+    places_px : ndarray or path, optional
+        As in `locate`, or a CSV file with columns ``x_px`` and ``y_px``, such as an earlier table.
 
     Raises
     ------
@@ -67,6 +74,11 @@ def locate_files(
     check_files([*tables_at, *written], files)  # before the work
     model = noise_model(noise)
     report = progress or no_progress
+    if isinstance(mask, str | Path):
+        mask = load_picture(Path(mask)).array != 0
+    if isinstance(places_px, str | Path):
+        places_px = read_places(Path(places_px))
+    options |= {"mask": mask, "places_px": places_px}
 
     def work(path: Path) -> tuple[Located, bytes]:
         name = frame_name(path)
@@ -94,6 +106,25 @@ def locate_files(
     contents = [found.content(one.path.suffix) for one in tables_at]
     write_together([*tables_at, *written], [*contents, *drawings[: len(written)]], files)
     return found
+
+
+def read_places(path: Path) -> np.ndarray:
+    """Read x and y, shape (n, 2), from a CSV file with columns ``x_px`` and ``y_px``; lines that begin with ``#`` are left out.
+
+    Raises
+    ------
+    InputError
+        If there is no such file, or no such columns of numbers in it.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
+        return np.array([(float(row["x_px"]), float(row["y_px"])) for row in rows]).reshape(-1, 2)
+    except OSError as problem:
+        raise InputError("file cannot be read", where=str(path), value=problem.strerror, remedy="check the name") from None
+    except (KeyError, TypeError, ValueError) as problem:
+        allowed = "columns x_px and y_px, a number in each row"
+        raise InputError("not a table of places", where=str(path), value=str(problem), allowed=allowed) from None
 
 
 def frames_inside(path: str | Path) -> Path:

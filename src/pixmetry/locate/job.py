@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,6 +10,8 @@ import numpy as np
 
 from pixmetry.camera.camera import Camera
 from pixmetry.core.errors import InputError
+from pixmetry.locate.detect.detection import THRESHOLD_SIGMA
+from pixmetry.locate.detect.limits import Limits
 from pixmetry.locate.estimators import estimators, methods
 from pixmetry.locate.frame import checked_frame, scale_ends
 from pixmetry.locate.kinds import Measured, Task, grid_size, locate_chessboard, locate_lines, locate_spots
@@ -31,6 +34,12 @@ def locate(
     aperture_px: float = 1.0,
     light_on: str = "surface",
     planes: str | bool = "auto",
+    rois: Sequence[tuple[int, int, int, int]] | None = None,
+    mask: np.ndarray | None = None,
+    places_px: np.ndarray | None = None,
+    diameter_px: tuple[float, float] | None = None,
+    contrast_dn: tuple[float, float] | None = None,
+    threshold_sigma: float = THRESHOLD_SIGMA,
     threads: int | None = None,
     name: str = "frame",
 ) -> Located:
@@ -59,6 +68,18 @@ def locate(
     planes : {"auto", "never", "always"} or bool
         Whether slopes of the light on a target and of the ground about it are unknowns of its template; "auto" takes them where they also
         predict pixels that were held back. True is "always", False "never".
+    rois : sequence of (row, col, rows, cols), optional
+        Regions in which targets are looked for, first pixel and size; what their borders cut is left out. Nothing outside them is known.
+    mask : ndarray of bool, shape (rows, cols), optional
+        True where the centres of targets may be.
+    places_px : ndarray, shape (n, 2), optional
+        x and y of the wanted targets, roughly: within their outlines or 3 px from them. The rows are in their order, and the column
+        ``place`` has their numbers.
+    diameter_px, contrast_dn : (float, float), optional
+        Least and greatest diameter at half height, and height over the background without sign. Like mask and places they choose rows: the
+        rows are what they are without.
+    threshold_sigma : float
+        Threshold of detection in standard deviations of the background's noise.
     threads : int, optional
     name : str
         Of the image, for the table.
@@ -98,10 +119,15 @@ def locate(
         raise InputError(what, where="aperture_px", value=aperture_px, allowed="1", remedy=remedy)
     if planes not in PLANES:
         raise InputError("no such choice of planes", where="planes", value=planes, allowed="auto, never, always")
+    limits = Limits(rois, mask, places_px, diameter_px, contrast_dn, threshold_sigma)
+    if limits.given and kind in WORK:
+        allowed = "disc, ellipse, ring, spot, coded"
+        raise InputError(f"{limits.given[0]} is not for targets of this kind", where="kind", value=kind, allowed=allowed)
     image = checked_frame(frame, name)
     model = noise_model(noise)
     low, high = scale_ends(image, bits, model)
-    task = Task(image, kind, estimator, polarity, grid_size(grid, kind), model, low, high, aperture_px, light_on, threads, PLANES[planes])
+    size = grid_size(grid, kind)
+    task = Task(image, kind, estimator, polarity, size, model, low, high, aperture_px, light_on, threads, PLANES[planes], limits)
     measured = Measured(*WORK.get(kind, locate_spots)(task))
     about = {"name": name, "rows": image.shape[0], "cols": image.shape[1], "targets": len(measured.columns["x_px"]), **measured.notes}
     if len(measured.left_out):

@@ -78,8 +78,8 @@ def find_spots(task: Task) -> Spots:
     seen_ones, left_out, polarities = detect_within(task.frame, wanted, look)
     shape = "ellipse" if task.kind == "coded" else task.kind
     fits = select(seen_ones, shape)
-    targets, others = wanted.wanted(seen_ones[fits], task.frame.shape)
-    left_out = LeftOut.joined([left_out, seen_at(seen_ones[~fits], f"not the shape of {WITH_ARTICLE[shape]}"), others])
+    targets = seen_ones[fits]
+    left_out = LeftOut.joined([left_out, seen_at(seen_ones[~fits], f"not the shape of {WITH_ARTICLE[shape]}")])
     seen, why = seen_shape(shape, targets)
     noise = _noise_for(task, seen, targets)  # with the targets' own shape, whatever measures them: what it does not explain is noise
     polarity = polarities.pop() if len(polarities) == 1 else "both"
@@ -114,8 +114,14 @@ def locate_spots(task: Task) -> Measured:
         columns = _beside(columns, grid_col=placed.col, grid_row=placed.row)
         count = f"{int(placed.placed[settled].sum())} of {int(settled.sum())} targets placed"
         notes["grid"] = placed.message or f"{placed.cols} x {placed.rows}, {count}"
-    left_out = LeftOut.joined([left_out, seen_at(targets[whole & ~settled], UNSETTLED)])
-    return Measured(_only(columns, whole & settled), notes, left_out)
+    index, others, place = task.limits.wanted(targets, task.frame.shape)  # all were measured, for each is another's neighbour
+    good = (whole & settled)[index]
+    left_out = LeftOut.joined([left_out, others, seen_at(targets[index[(whole & ~settled)[index]]], UNSETTLED)])
+    if place is not None:
+        numbers = np.full(len(positions), -1)
+        numbers[index] = place
+        columns = _beside(columns, place=numbers)
+    return Measured(_only(columns, index[good]), notes, left_out)
 
 
 def locate_lines(task: Task) -> Measured:
@@ -270,8 +276,9 @@ def settled_ones(positions: Positions) -> np.ndarray:
 
 
 def _only(columns: dict[str, np.ndarray], which: np.ndarray) -> dict[str, np.ndarray]:
-    """Some rows of the columns, numbered anew."""
-    return {name: values[which] for name, values in columns.items()} | {"target": np.arange(int(which.sum()))}
+    """Some rows of the columns, numbered anew; by mask or index."""
+    rows = {name: values[which] for name, values in columns.items()}
+    return rows | {"target": np.arange(len(rows["x_px"]))}
 
 
 def _beside(columns: dict[str, np.ndarray], **more: np.ndarray) -> dict[str, np.ndarray]:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, fields, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from pixmetry.core.errors import InputError
 from pixmetry.locate.detect.detection import THRESHOLD_SIGMA, Regions, seen_at
-from pixmetry.locate.detect.targets import LeftOut
+from pixmetry.locate.detect.targets import LeftOut, Targets
 
 SAME_PX = 1.0  # two regions of interest that overlap show one target at places that differ by less
 NEAR_PX = 3.0  # beyond a target's outline, at which a given place is still its
@@ -60,12 +60,14 @@ class Limits:
         if self.places_px is not None:
             places = np.asarray(self.places_px, float)
             if places.ndim != 2 or places.shape[1] != 2 or not len(places) or not np.isfinite(places).all():
-                raise InputError("not places", where="positions", value=places.shape, allowed="shape (n, 2): x and y of one target or more")
+                raise InputError("not places", where="places_px", value=places.shape, allowed="shape (n, 2): x and y of one target or more")
 
     @property
-    def given(self) -> bool:
-        """Whether there are any."""
-        return self != Limits()
+    def given(self) -> tuple[str, ...]:
+        """Names of those that are not as by default."""
+        named = ("rois", "mask", "places_px", "diameter_px", "contrast_dn")
+        given = tuple(name for name in named if getattr(self, name) is not None)
+        return given + (("threshold_sigma",) if self.threshold_sigma != THRESHOLD_SIGMA else ())
 
     def boxes(self, shape: tuple[int, int]) -> list[tuple[int, int, int, int]]:
         """The regions of interest as first row, stop row, first column, stop column; the whole frame if there are none.
@@ -81,6 +83,7 @@ class Limits:
         for roi in self.rois:
             try:
                 row, col, rows, cols = (int(v) for v in roi)
+                row = row if all(int(v) == v for v in roi) else -1
             except (TypeError, ValueError):
                 row = col = rows = cols = -1
             if min(row, col) < 0 or min(rows, cols) < 1 or row + rows > shape[0] or col + cols > shape[1]:
@@ -89,20 +92,21 @@ class Limits:
             boxes.append((row, row + rows, col, col + cols))
         return boxes
 
-    def wanted(self, targets: Regions, shape: tuple[int, int]) -> tuple[Regions, LeftOut]:
-        """The targets that are wanted, in the order of the given places where there are such, and why the others are not.
+    def wanted(self, targets: Targets, shape: tuple[int, int]) -> Wanted:
+        """Choose the targets that are wanted, and tell why the others are not.
 
         Raises
         ------
         InputError
             If the mask has another shape than the frame.
         """
+        left = np.arange(len(targets))
         left_out = []
 
         def keep(good: np.ndarray, reason: str) -> None:
-            nonlocal targets
-            left_out.append(seen_at(targets[~good], reason))
-            targets = targets[good]
+            nonlocal left
+            left_out.append(seen_at(targets[left[~good[left]]], reason))
+            left = left[good[left]]
 
         if self.mask is not None:
             mask = np.asarray(self.mask)
@@ -116,29 +120,37 @@ class Limits:
         if self.contrast_dn is not None:
             height = np.abs(targets.amplitude_dn)
             keep((height >= self.contrast_dn[0]) & (height <= self.contrast_dn[1]), "contrast lower or higher than asked for")
-        if self.places_px is not None:
-            at, missed = _at_places(targets, np.asarray(self.places_px, float))
-            left_out.append(seen_at(targets[np.setdiff1d(np.arange(len(targets)), at)], "not at a given place"))
-            left_out.append(LeftOut.of(missed[:, 0], missed[:, 1], "no target at a given place"))
-            targets = targets[at]
-        return targets, LeftOut.joined(left_out)
+        if self.places_px is None:
+            return Wanted(left, LeftOut.joined(left_out), None)
+        places = np.asarray(self.places_px, float)
+        of = _at_places(targets[left], places)
+        there = np.flatnonzero(of >= 0)
+        at, missed = left[of[there]], places[of < 0]
+        left_out.append(seen_at(targets[np.setdiff1d(left, at)], "not at a given place"))
+        left_out.append(LeftOut.of(missed[:, 0], missed[:, 1], "no target at a given place"))
+        return Wanted(at, LeftOut.joined(left_out), there)
 
 
-def _at_places(targets: Regions, places: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Indices of the targets at given places, in their order, each target once; and the places where there is none."""
+class Wanted(NamedTuple):
+    """Which targets are wanted."""
+
+    rows: np.ndarray  # indices, shape (m,), in the order of the given places where there are such
+    left_out: LeftOut
+    place: np.ndarray | None  # shape (m,): number of the given place of each
+
+
+def _at_places(targets: Targets, places: np.ndarray) -> np.ndarray:
+    """The target at each given place, −1 for none; one that several places mean belongs to the nearest of them."""
     from scipy.spatial import cKDTree
 
-    if not len(targets):
-        return np.zeros(0, int), places
-    away, which = cKDTree(np.column_stack([targets.x_px, targets.y_px])).query(places)
-    good = away < targets.semi_major_px[which] + NEAR_PX
-    for i in np.flatnonzero(good):
-        same = good & (which == which[i])
-        good[same & (away > away[same].min())] = False
-    first = np.zeros(len(places), bool)
-    first[np.unique(np.where(good, which, -1), return_index=True)[1]] = True
-    good &= first
-    return which[good], places[~good]
+    of = np.full(len(places), -1)
+    if len(targets):
+        away, which = cKDTree(np.column_stack([targets.x_px, targets.y_px])).query(places)
+        taken = np.zeros(len(targets), bool)
+        for i in np.argsort(away, kind="stable"):
+            if away[i] < targets.semi_major_px[which[i]] + NEAR_PX and not taken[which[i]]:
+                of[i], taken[which[i]] = which[i], True
+    return of
 
 
 def detect_within(frame: np.ndarray, limits: Limits, look: Callable[[np.ndarray], Any]) -> tuple[Regions, LeftOut, set[str]]:
@@ -159,8 +171,6 @@ def detect_within(frame: np.ndarray, limits: Limits, look: Callable[[np.ndarray]
     set of str
         Polarities that were found.
     """
-    from dataclasses import fields, replace
-
     parts, left_out, polarities = [], [], set()
     for top, bottom, left, right in limits.boxes((frame.shape[0], frame.shape[1])):
         whole = (bottom - top, right - left) == frame.shape
