@@ -14,6 +14,7 @@ from scipy.stats import chi2
 from calibrate.networks import disturbed, predicted, simulate
 from pixmetry.calibrate.bundle import bundle, bundle_covariance, bundle_system
 from pixmetry.calibrate.bundle.bundle import adjust
+from pixmetry.calibrate.bundle.model import NAMES
 from pixmetry.calibrate.bundle.network import Network, ScaleBars, State
 from pixmetry.calibrate.checks.known_residuals import bar_residuals
 from pixmetry.core.errors import InputError, MeasureError
@@ -401,7 +402,7 @@ def test_a_long_lens_with_a_wrong_start_comes_down_quickly(field, rng):
     simulated = simulate(rng, images=12, points=60, field=field, interior=lens)
     network, start = simulated.network, disturbed(rng, simulated, 0.003)
     start.interior[:, 0] = 1.05 * simulated.truth.interior[:, 0]
-    held = replace(network.cameras[0], free=np.zeros(12, bool))
+    held = replace(network.cameras[0], free=np.zeros(len(NAMES), bool))
     valley = adjust(replace(network, cameras=(held,)), start, covariance=False)
     found = adjust(network, valley.state)
     assert valley.sigma0 > 3 > 1.4 > found.sigma0 and found.iterations <= 15
@@ -432,7 +433,7 @@ def test_no_matrix_of_points_by_points(rng):
 def test_one_image_of_known_points_gets_its_pose_only(rng):
     simulated = simulate(rng, images=5, points=20, known="fixed", bars=0)
     network, truth = simulated.network, simulated.truth
-    known = replace(network.cameras[0], free=np.zeros(12, bool), values=truth.interior[0])
+    known = replace(network.cameras[0], free=np.zeros(len(NAMES), bool), values=truth.interior[0])
     start = replace(disturbed(rng, simulated), interior=truth.interior)
     found = adjust(replace(network, cameras=(known,)), start, used=network.image == 2, a_priori=True)
     assert found.free_columns == tuple(f"{network.images[2]}:{name}" for name in ("rx", "ry", "rz", "X0", "Y0", "Z0"))
@@ -449,7 +450,7 @@ def test_fixed_points_in_line_leave_a_turn_open(rng):
     line = np.linspace(-100, 100, 12)[:, None] * [1.0, 0.3, 0.2]
     truth = replace(simulated.truth, xyz=line)
     x, y = predicted(simulated.network, truth).T
-    camera = replace(simulated.network.cameras[0], free=np.zeros(12, bool))
+    camera = replace(simulated.network.cameras[0], free=np.zeros(len(NAMES), bool))
     network = replace(simulated.network, cameras=(camera,), x_px=x, y_px=y, xyz=line, u_xyz=np.zeros((12, 3)))
     with pytest.raises(MeasureError, match="leaves 1 of the seven"):
         adjust(network, truth)

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from pixmetry.calibrate.bundle.model import CameraModel, Sensor
-from pixmetry.calibrate.exchange import read_opencv
-from pixmetry.calibrate.files.write import check_exports, write_exports
+from pixmetry.calibrate.exchange import model_of_colmap, read_opencv
+from pixmetry.calibrate.files.exports import FORMATS, check_exports, write_exports
+from pixmetry.calibrate.files.imports import read_cameras
 from pixmetry.calibrate.job import _changed
 from pixmetry.calibrate.project.schema import ProjectModel
 from pixmetry.core.config import validate
@@ -22,14 +23,14 @@ MODEL = CameraModel.of(Sensor(640, 480), "object_to_image", c=800.0, k1=-0.1, na
 
 def test_each_camera_has_a_file_of_its_own(tmp_path: Path) -> None:
     other = replace(MODEL.with_values(c=900.0), name="right")
-    write_exports([MODEL, other], tmp_path / "camera.yaml", None)
+    write_exports([MODEL, other], {"opencv": tmp_path / "camera.yaml"})
     read = {path.name: read_opencv(path)["c"] for path in tmp_path.iterdir()}
     assert read == {"camera-left_eye.yaml": pytest.approx(800), "camera-right.yaml": pytest.approx(900)}
 
 
 def test_names_that_would_be_one_file_are_refused_before_anything_is_written(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="two cameras"):
-        write_exports([MODEL, replace(MODEL, name="left_eye")], tmp_path / "camera.yaml", tmp_path / "cameras.txt")
+        write_exports([MODEL, replace(MODEL, name="left_eye")], {"opencv": tmp_path / "camera.yaml", "colmap": tmp_path / "cameras.txt"})
     assert not list(tmp_path.iterdir())
 
 
@@ -39,15 +40,15 @@ def test_only_earlier_exports_are_replaced(name: str, tmp_path: Path) -> None:
     path, other = tmp_path / name, tmp_path / "other"
     opencv, colmap = (other.with_suffix(".xml"), path) if name.endswith(".txt") else (path, other)
     for c in (800.0, 900.0):
-        write_exports([MODEL.with_values(c=c)], opencv, colmap)
+        write_exports([MODEL.with_values(c=c)], {"opencv": opencv, "colmap": colmap})
         assert read_opencv(opencv)["c"] == pytest.approx(c)
     raw = path.read_bytes()
     theirs = raw.replace(raw[raw.index(b"ritten") - 1 :].split(b"\n")[0], b"") if name.endswith(".txt") else _of_opencv(path)
     path.write_bytes(theirs)
     before = {p.name: p.read_bytes() for p in tmp_path.iterdir()}
-    for attempt in (check_exports, lambda o, c, _: write_exports([MODEL], o, c)):
+    for attempt in (check_exports, lambda wanted, _: write_exports([MODEL], wanted)):
         with pytest.raises(InputError, match=f"{name}: file exists and is no result of this kind"):
-            attempt(opencv, colmap, tmp_path / "results")
+            attempt({"opencv": opencv, "colmap": colmap}, tmp_path / "results")
     assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == before
 
 
@@ -56,6 +57,96 @@ def _of_opencv(path: Path) -> bytes:
     storage = cv2.FileStorage(path.suffix, cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY)
     storage.write("camera_matrix", np.diag([800.0, 800.0, 1.0]))
     return storage.releaseAndGetString().encode()
+
+
+LENS = {"c": 700.0, "xp": 330.0, "yp": 236.0, "b1": 2e-3, "k1": -0.12, "k2": 0.03, "p1": 1e-3, "p2": -8e-4}
+FILES = {"ros": "a.yaml", "kalibr": "b.yaml", "mrcal": "c.cameramodel", "metashape": "d.xml", "matlab": "e.m"}
+FILES |= {"opencv": "f.yml", "colmap": "g.txt"}
+FORMS = {
+    "brown": (LENS, "perspective"),
+    "rational": (LENS | {"k3": 0.01, "d1": 0.2, "d2": 0.05}, "perspective"),
+    "fisheye": ({**LENS, "c": 300.0, "p1": 0.0, "p2": 0.0}, "equidistant"),
+}
+HOLD = {
+    "brown": set(FILES),
+    "rational": {"ros", "mrcal", "opencv", "colmap"},
+    "fisheye": {"ros", "kalibr", "metashape", "opencv", "colmap"},
+}
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_each_format_holds_what_it_can_and_gives_it_back(form: str, tmp_path: Path) -> None:
+    """Files that can hold the lens are written and read back to rounding; the others are refused, and stop nothing."""
+    lens, projection = FORMS[form]
+    model = CameraModel.of(Sensor(640, 480), "object_to_image", name="eye", projection=projection, **lens)
+    made = write_exports([model], {name: tmp_path / file for name, file in FILES.items()})
+    written = {name for name, file in FILES.items() if (tmp_path / file).exists()}
+    assert written == HOLD[form] and len(made.refused) == len(FILES) - len(written)
+    assert len(made.sentences) == len(written) and all("nothing is lost" in sentence for sentence in made.sentences)
+    assert all("px would be lost" in str(problem) or "no place" in str(problem) for _, problem in made.refused)
+    for name in written - {"matlab", "colmap", "opencv"}:
+        ((_, back),) = read_cameras(tmp_path / FILES[name]).items()
+        assert (back.sensor, back.projection) == (model.sensor, model.projection)
+        np.testing.assert_allclose(back.values, model.values, rtol=1e-12, atol=1e-15, err_msg=name)
+    np.testing.assert_allclose(read_opencv(tmp_path / FILES["opencv"]).values, model.values, rtol=1e-12, atol=1e-15)
+    colmap = model_of_colmap((tmp_path / FILES["colmap"]).read_text().splitlines()[-1])
+    np.testing.assert_allclose(colmap.values, model.values, rtol=1e-12, atol=1e-15)
+    assert colmap.projection == projection
+
+
+def test_the_files_of_ros_are_read_by_opencv(tmp_path: Path) -> None:
+    """cv2.FileStorage reads the same numbers from the file with OpenCV's head."""
+    write_exports([MODEL], {"ros": tmp_path / "ros.yaml"})
+    text = (tmp_path / "ros.yaml").read_text()
+    storage = cv2.FileStorage("%YAML:1.0\n---\n" + text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+    numbers = storage.getNode("camera_matrix").getNode("data")
+    assert [numbers.at(k).real() for k in range(numbers.size())] == [800, 0, 319.5, 0, 800, 239.5, 0, 0, 1]
+    assert storage.getNode("distortion_model").string() == "plumb_bob" and storage.getNode("image_width").real() == 640
+
+
+def test_what_a_program_reads_is_where_it_looks(tmp_path: Path) -> None:
+    """Published conventions: MATLAB counts pixels from 1, Metashape's cx counts from the middle and b1 is in pixels; mrcal is Python."""
+    model = CameraModel.of(Sensor(640, 480), "object_to_image", name="eye", **LENS)
+    write_exports([model], {name: tmp_path / file for name, file in FILES.items()})
+    assert "[331.0 237.0], [480 640]" in (tmp_path / "e.m").read_text()
+    metashape = (tmp_path / "d.xml").read_text()
+    assert "<cx>10.5</cx>" in metashape and "<f>700.0</f>" in metashape
+    assert float(metashape.partition("<b1>")[2].partition("<")[0]) == pytest.approx(1.4)
+    mrcal = eval((tmp_path / "c.cameramodel").read_text())
+    assert mrcal["lensmodel"] == "LENSMODEL_OPENCV5" and mrcal["intrinsics"][6:8] == [LENS["p2"], LENS["p1"]]
+
+
+def test_the_chain_of_kalibr_says_how_the_cameras_stand(rng: np.random.Generator, tmp_path: Path) -> None:
+    """T_cn_cnm1 takes a point of camera 0 to camera 1, in metres."""
+    from calibrate.rigs import simulated_rig
+    from pixmetry.calibrate.bundle.bundle import adjust
+    from pixmetry.calibrate.checks.rig_check import rig_record
+    from pixmetry.core.config import load_yaml
+
+    sim = simulated_rig(rng, direction="object_to_image", instants=5)
+    found = adjust(sim.network, sim.truth)
+    write_exports([found.camera(0), found.camera(1)], {"kalibr": tmp_path / "chain.yaml"}, rig=rig_record(found))
+    T = np.array(load_yaml(tmp_path / "chain.yaml")["cam1"]["T_cn_cnm1"])
+    point = np.array([100.0, -50, 900])
+    inside = [(point - found.state.position[k]) @ found.state.rotation[k].T / 1000 for k in (0, 1)]
+    np.testing.assert_allclose((T @ [*inside[0], 1])[:3], inside[1], atol=1e-9)
+
+
+def test_a_lens_without_inverse_in_a_corner_is_written_and_says_so(tmp_path: Path) -> None:
+    """Strong barrel distortion folds the corners over: what has an inverse is compared, the sentence names the rest."""
+    model = CameraModel.of(Sensor(640, 480), "object_to_image", c=300.0, k1=-0.22, k2=0.0, b2=1e-5, name="eye")
+    u, _ = model.direction_of(np.array([0.0]), np.array([0.0]))
+    assert np.isnan(u).all()
+    made = write_exports([model], {"opencv": tmp_path / "f.yml", "ros": tmp_path / "a.yaml"}, may_lose_px=0.1)
+    assert not made.refused and all("of the frame the calibrated lens has no inverse" in sentence for sentence in made.sentences)
+
+
+def test_formats_and_endings_are_checked_before_the_work(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="no such format"):
+        check_exports({"word": tmp_path / "a.doc"}, tmp_path / "r")
+    for name in set(FORMATS) - {"colmap"}:
+        with pytest.raises(InputError, match="ending|storage"):
+            check_exports({name: tmp_path / "a.doc"}, tmp_path / "r")
 
 
 def test_pictures_have_no_other_coordinates() -> None:

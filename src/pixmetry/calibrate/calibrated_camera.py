@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from pixmetry.calibrate.bundle.model import NAMES, CameraModel
+from pixmetry.calibrate.bundle.model import NAMES, POWERS, CameraModel
 from pixmetry.calibrate.checks.causes import STRONG
 from pixmetry.calibrate.files.record import StoredCalibration, read_calibration
 from pixmetry.calibrate.records import Calibration, FieldSources, HeightMap, ImageScales, Seams
@@ -131,12 +131,8 @@ def with_pitch(
     if not np.isclose(x, y, rtol=1e-6):
         what, remedy = "a calibration in pixels that are not square", "calibrate with pitch_x_um and pitch_y_um"
         raise InputError(what, where=model.name, value=f"{x:g} × {y:g} µm", allowed="square pixels", remedy=remedy)
-    mm, power = x / 1000, np.zeros(len(NAMES))
-    power[0] = 1
-    if model.direction == "image_to_object":
-        power[NAMES.index("p1") : NAMES.index("p2") + 1] = -1
-        power[NAMES.index("k1") :] = -2 * np.arange(1, len(NAMES) - NAMES.index("k1") + 1)
-    factor = mm**power
+    power = np.where(np.isin(NAMES, ["c"]) | (model.direction == "image_to_object"), POWERS, 0)
+    factor = (x / 1000) ** power.astype(float)
     own = factor[[NAMES.index(name) for name in names]]
     changed = replace(model, sensor=replace(model.sensor, pitch_x_um=x, pitch_y_um=y), values=model.values * factor)
     return changed, covariance * np.outer(own, own)

@@ -1,7 +1,8 @@
 """Camera models of OpenCV and COLMAP: written only where nothing is lost, or no more than was allowed.
 
-OpenCV (and COLMAP's OPENCV family) goes from object to image with K1, K2, P1, P2, K3 and knows no shear; COLMAP counts pixels from the
-corner of the top-left pixel, so that its principal point is half a pixel greater. Neither has a place for uncertainties.
+OpenCV (and COLMAP's OPENCV family) goes from object to image with K1, K2, P1, P2, K3, a denominator and prisms, and knows no shear; its
+fisheye is equidistant, with K1 … K4. COLMAP counts pixels from the corner of the top-left pixel, so that its principal point is half a
+pixel greater. Neither has a place for uncertainties.
 
 References
 ----------
@@ -16,22 +17,29 @@ from typing import Any
 
 import numpy as np
 
-from pixmetry.calibrate.bundle.model import NAMES, CameraModel, Direction, Sensor
+from pixmetry.calibrate.bundle.model import NAMES, CameraModel, Direction, Projection, Sensor
 from pixmetry.core.arrays import Array
 from pixmetry.core.errors import InputError
 from pixmetry.core.extras import import_extra
 
 GRID = 33  # places along each side of the frame at which two models are compared
 EXACT_PX = 1e-9
+LEAST_SHARE = 0.5  # of the frame in which a lens must have an inverse, to be compared
+PROJECTED_PX = 5.0  # apart at most, where a model stands for one of another projection
 STORAGES = (".yaml", ".yml", ".xml", ".json")  # endings of files of OpenCV's FileStorage
-OPENCV = ("c", "xp", "yp", "b1", "p1", "p2", "k1", "k2", "k3")  # what its five coefficients hold
+OPENCV = ("c", "xp", "yp", "b1", "p1", "p2", "k1", "k2", "k3")  # what its five coefficients hold,
+RATIONAL = (*OPENCV, "d1", "d2", "d3")  # what eight hold, and
+PRISMATIC = (*RATIONAL, "s1", "s2", "s3", "s4")  # what twelve hold
+FISHEYE = ("c", "xp", "yp", "b1", "k1", "k2", "k3", "k4")  # what its fisheye holds
+ORDER = ("k1", "k2", "p2", "p1", "k3", "d1", "d2", "d3", "s1", "s2", "s3", "s4")  # our names of its coefficients
 COLMAP: dict[str, tuple[str, ...]] = {  # by name: our parameters that it holds, besides c, xp and yp
     "SIMPLE_PINHOLE": (),
     "PINHOLE": ("b1",),
     "SIMPLE_RADIAL": ("k1",),
     "RADIAL": ("k1", "k2"),
     "OPENCV": ("b1", "k1", "k2", "p1", "p2"),
-    "FULL_OPENCV": ("b1", "k1", "k2", "p1", "p2", "k3"),
+    "FULL_OPENCV": ("b1", "k1", "k2", "p1", "p2", "k3", "d1", "d2", "d3"),
+    "OPENCV_FISHEYE": ("b1", "k1", "k2", "k3", "k4"),
 }
 
 
@@ -44,14 +52,19 @@ class Converted:
     model : CameraModel
     largest_px : float
         How far apart the two models see a point at most, over the frame; 0 where the form is exact.
+    share : float
+        Of the frame that was compared: in the rest the distortion has no inverse.
     """
 
     model: CameraModel
     largest_px: float
+    share: float = 1.0
 
 
-def converted(model: CameraModel, direction: Direction, names: tuple[str, ...] = NAMES) -> Converted:
-    """The model in another direction, or with fewer parameters: fitted all over the frame by least squares.
+def converted(
+    model: CameraModel, direction: Direction, names: tuple[str, ...] = NAMES, projection: Projection | None = None
+) -> Converted:
+    """The model in another direction or projection, or with fewer parameters: fitted all over the frame by least squares.
 
     Parameters
     ----------
@@ -59,6 +72,8 @@ def converted(model: CameraModel, direction: Direction, names: tuple[str, ...] =
     direction : {"image_to_object", "object_to_image"}
     names : tuple of str
         Parameters the new form has; the others are 0.
+    projection : str, optional
+        By default that of the model.
 
     Returns
     -------
@@ -67,23 +82,26 @@ def converted(model: CameraModel, direction: Direction, names: tuple[str, ...] =
     Raises
     ------
     InputError
-        If the model cannot be inverted all over the frame.
+        If the model cannot be inverted in half of the frame, or is a fisheye that another projection cannot stand for.
     """
     kept = np.isin(NAMES, names)
-    if direction == model.direction and not model.values[~kept].any():
+    projection = projection or model.projection
+    if (direction, projection) == (model.direction, model.projection) and not model.values[~kept].any():
         return Converted(model, 0.0)
     from scipy.optimize import least_squares
 
     x, y = (v.ravel() for v in np.meshgrid(np.linspace(0, model.sensor.cols - 1, GRID), np.linspace(0, model.sensor.rows - 1, GRID)))
     u, v = model.direction_of(x, y)
-    if not np.isfinite(u + v).all():
+    there = np.isfinite(u + v)
+    if there.mean() < LEAST_SHARE:
         remedy = "use fewer radial parameters, or targets nearer to the corners"
-        raise InputError("the distortion has no inverse in a part of the frame", where=model.name, remedy=remedy)
+        raise InputError("the distortion has no inverse in most of the frame", where=model.name, remedy=remedy)
+    x, y, u, v = x[there], y[there], u[there], v[there]
     start = np.where(kept & np.isin(NAMES, ("c", "xp", "yp", "b1", "b2")), model.values, 0.0)
     if direction != model.direction:
         start[3:5] *= -1  # to first order
         start[0] *= 1 - start[3] * (direction == "image_to_object")
-    new = replace(model, direction=direction, values=start)
+    new = replace(model, direction=direction, projection=projection, values=start)
 
     def at(values: np.ndarray) -> CameraModel:
         row = start.copy()
@@ -101,11 +119,18 @@ def converted(model: CameraModel, direction: Direction, names: tuple[str, ...] =
 
     fit = least_squares(misses, start[kept], slopes, x_scale="jac", xtol=1e-15, ftol=1e-15, gtol=1e-15)
     miss = misses(fit.x).reshape(2, -1)
-    return Converted(at(fit.x), float(np.hypot(*miss).max()))
+    largest = float(np.hypot(*miss).max())
+    if projection != model.projection and largest > PROJECTED_PX:  # a few terms of one projection do not stand for another
+        what = f"a fisheye ({model.projection})" if projection == "perspective" else f"a {model.projection} lens"
+        raise InputError(f"{what}, for which this form has no place", where=model.name, allowed=projection)
+    return Converted(at(fit.x), largest, float(there.mean()))
 
 
 def opencv_form(model: CameraModel, tolerance_px: float = 0.0) -> dict[str, Any]:
-    """What OpenCV takes: ``camera_matrix`` (3, 3), ``distortion_coefficients`` (5,) k1, k2, p1, p2, k3, ``image_size`` (cols, rows).
+    """What OpenCV takes: ``camera_matrix`` (3, 3), ``distortion_coefficients``, ``image_size`` (cols, rows), ``fisheye``.
+
+    Coefficients are (5,) k1, k2, p1, p2, k3, or as many more as the model needs: (8,) with a denominator, (12,) with thin prisms; of a
+    fisheye the (4,) of ``cv2.fisheye``.
 
     Parameters
     ----------
@@ -119,13 +144,20 @@ def opencv_form(model: CameraModel, tolerance_px: float = 0.0) -> dict[str, Any]
     InputError
         If more than that would be lost; it says what.
     """
-    form = _held(model, OPENCV, tolerance_px, "OpenCV")
+    fisheye = model.projection != "perspective"
+    names = FISHEYE if fisheye else PRISMATIC if _uses(model, "s") else RATIONAL if _uses(model, "d") else OPENCV
+    form = held(model, names, tolerance_px, "OpenCV's fisheye" if fisheye else "OpenCV", "equidistant" if fisheye else "perspective")
     fx, _, fy, cx, cy = vision_values(form)
     return {
+        "fisheye": fisheye,
         "image_size": (form.sensor.cols, form.sensor.rows),
         "camera_matrix": np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]),
-        "distortion_coefficients": np.array([form["k1"], form["k2"], form["p2"], form["p1"], form["k3"]]),
+        "distortion_coefficients": np.array([form[name] for name in (FISHEYE[4:] if fisheye else ORDER[: len(names) - 4])]),
     }
+
+
+def _uses(model: CameraModel, letter: str) -> bool:
+    return any(value for name, value in zip(NAMES, model.values, strict=True) if name[0] == letter)
 
 
 def opencv_text(model: CameraModel, ending: str, tolerance_px: float = 0.0) -> str:
@@ -154,7 +186,9 @@ def opencv_text(model: CameraModel, ending: str, tolerance_px: float = 0.0) -> s
     storage.write("image_width", int(form["image_size"][0]))
     storage.write("image_height", int(form["image_size"][1]))
     storage.write("camera_matrix", form["camera_matrix"])
-    storage.write("distortion_coefficients", form["distortion_coefficients"].reshape(1, 5))
+    storage.write("distortion_coefficients", form["distortion_coefficients"].reshape(1, -1))
+    if form["fisheye"]:
+        storage.write("fisheye_model", 1)
     return str(storage.releaseAndGetString())
 
 
@@ -179,7 +213,7 @@ def read_opencv(path: str | Path, pitch_um: tuple[float, float] | None = None) -
     Raises
     ------
     InputError
-        If the file cannot be read, or holds what would be lost here: a fisheye or rational model, thin prisms, a tilted sensor.
+        If the file cannot be read, or holds what would be lost here: a tilted sensor.
     """
     cv2 = import_extra("cv2")
 
@@ -200,7 +234,8 @@ def read_opencv(path: str | Path, pitch_um: tuple[float, float] | None = None) -
     matrix = np.asarray(node("camera_matrix", "cameraMatrix", "CameraMatrix", "K").mat(), float)
     lens = np.asarray(node("distortion_coefficients", "dist_coeffs", "distCoeffs", "D").mat(), float).ravel()
     size = int(node("image_width", "imageWidth", "width").real()), int(node("image_height", "imageHeight", "height").real())
-    return model_of_opencv(matrix, lens, size, pitch_um, where=str(source))
+    fisheye = not storage.getNode("fisheye_model").empty() and bool(storage.getNode("fisheye_model").real())
+    return model_of_opencv(matrix, lens, size, pitch_um, where=str(source), fisheye=fisheye)
 
 
 def model_of_opencv(
@@ -209,25 +244,32 @@ def model_of_opencv(
     image_size: tuple[int, int],
     pitch_um: tuple[float, float] | None = None,
     where: str = "camera",
+    *,
+    fisheye: bool = False,
 ) -> CameraModel:
-    """The model of an OpenCV camera matrix (3, 3) and its 0, 4 or 5 coefficients; more only if they are 0. Raises like `read_opencv`."""
+    """The model of an OpenCV camera matrix (3, 3) and its 0, 4, 5, 8, 12 or 14 coefficients (the last two 0), or the four of its fisheye.
+
+    Raises like `read_opencv`.
+    """
     k = np.asarray(camera_matrix, float)
-    d = np.zeros(5)
     lens = np.asarray(distortion, float).ravel()
     if k.shape != (3, 3) or not np.isfinite(k).all() or not (k[0, 0] > 0 and k[1, 1] > 0):
         raise InputError("not a camera matrix", where=where, allowed="3 × 3 with positive focal lengths")
     if len(lens) not in (0, 4, 5, 8, 12, 14) or not np.isfinite(lens).all():
         raise InputError("not OpenCV's coefficients", where=where, value=lens.tolist(), allowed="0, 4, 5, 8, 12 or 14 numbers")
-    if lens[5:].any():
-        what = "a rational, thin-prism or tilted model, which pixmetry cannot represent"
-        raise InputError(what, where=where, value=lens[5:].tolist(), allowed="k1, k2, p1, p2, k3; the others 0")
-    d[: min(len(lens), 5)] = lens[:5]
+    if fisheye and len(lens) not in (0, 4):
+        raise InputError("not the coefficients of OpenCV's fisheye", where=where, value=lens.tolist(), allowed="0 or 4 numbers")
+    if lens[12:].any():
+        what = "a tilted sensor, which pixmetry cannot represent"
+        raise InputError(what, where=where, value=lens[12:].tolist(), allowed="the thirteenth and fourteenth coefficient 0")
+    names = FISHEYE[4:] if fisheye else ORDER
+    values = dict(zip(names, lens, strict=False))
     mx, my = (1.0, 1.0) if pitch_um is None else (pitch_um[0] / 1000, pitch_um[1] / 1000)
     sensor = Sensor(*image_size, *(pitch_um or (None, None)))
     c = k[1, 1] * my
     return CameraModel.of(
-        sensor, "object_to_image", name="camera",
-        c=c, xp=k[0, 2], yp=k[1, 2], b1=k[0, 0] * mx / c - 1, b2=k[0, 1] * mx / c, k1=d[0], k2=d[1], p2=d[2], p1=d[3], k3=d[4],
+        sensor, "object_to_image", name="camera", projection="equidistant" if fisheye else "perspective",
+        c=c, xp=k[0, 2], yp=k[1, 2], b1=k[0, 0] * mx / c - 1, b2=k[0, 1] * mx / c, **values,
     )  # fmt: skip
 
 
@@ -250,13 +292,14 @@ def colmap_line(model: CameraModel, camera_id: int = 1, kind: str = "FULL_OPENCV
     """
     if kind not in COLMAP:
         raise InputError("no such camera model of COLMAP", where="kind", value=kind, allowed=", ".join(COLMAP))
-    form = _held(model, ("c", "xp", "yp", *COLMAP[kind]), tolerance_px, f"COLMAP's {kind}")
+    projection: Projection = "equidistant" if kind == "OPENCV_FISHEYE" else "perspective"
+    form = held(model, ("c", "xp", "yp", *COLMAP[kind]), tolerance_px, f"COLMAP's {kind}", projection)
     fx, _, fy, cx, cy = vision_values(form)
     if "b1" not in COLMAP[kind] and abs(fx - fy) * max(form.sensor.cols, form.sensor.rows) > EXACT_PX * fy:
         raise InputError(f"COLMAP's {kind} has one focal length", where=form.name, value=(fx, fy), remedy="take PINHOLE or OPENCV")
     focal = [fx, fy] if "b1" in COLMAP[kind] else [fx]
-    lens = {"OPENCV": ("k1", "k2", "p2", "p1"), "FULL_OPENCV": ("k1", "k2", "p2", "p1", "k3")}.get(kind, COLMAP[kind])
-    numbers = [*focal, cx + 0.5, cy + 0.5, *(form[n] for n in lens if n != "b1"), *([0.0] * 3 if kind == "FULL_OPENCV" else [])]
+    lens = {"OPENCV": ORDER[:4], "FULL_OPENCV": ORDER[:8]}.get(kind, COLMAP[kind])
+    numbers = [*focal, cx + 0.5, cy + 0.5, *(form[n] for n in lens if n != "b1")]
     return " ".join([str(camera_id), kind, str(form.sensor.cols), str(form.sensor.rows), *(repr(float(v)) for v in numbers)])
 
 
@@ -266,10 +309,10 @@ def model_of_colmap(line: str, pitch_um: tuple[float, float] | None = None) -> C
     Raises
     ------
     InputError
-        If the line cannot be read, or its model holds what would be lost here (fisheye, field of view, rational terms).
+        If the line cannot be read, or its model holds what would be lost here (field of view, other fisheyes).
     """
     parts = line.split()
-    counts = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8, "FULL_OPENCV": 12}
+    counts = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4, "SIMPLE_RADIAL": 4, "RADIAL": 5, "OPENCV": 8, "FULL_OPENCV": 12, "OPENCV_FISHEYE": 8}
     try:
         kind, cols, rows, q = parts[1], int(parts[2]), int(parts[3]), [float(v) for v in parts[4:]]
     except (IndexError, ValueError):
@@ -284,7 +327,7 @@ def model_of_colmap(line: str, pitch_um: tuple[float, float] | None = None) -> C
     lens = [*q[4:6], 0.0, 0.0][:2] + [0.0] * 2 if kind.endswith("RADIAL") else q[4:]
     lens = [lens[0], 0.0, 0.0, 0.0] if kind == "SIMPLE_RADIAL" else lens
     matrix = np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1.0]])
-    return model_of_opencv(matrix, np.array(lens), (cols, rows), pitch_um, where="COLMAP")
+    return model_of_opencv(matrix, np.array(lens), (cols, rows), pitch_um, where="COLMAP", fisheye=kind == "OPENCV_FISHEYE")
 
 
 def vision_values(model: CameraModel) -> tuple[float, float, float, float, float]:
@@ -293,13 +336,23 @@ def vision_values(model: CameraModel) -> tuple[float, float, float, float, float
     return c * (1 + model["b1"]) / mx, c * model["b2"] / mx, c / my, model["xp"], model["yp"]
 
 
-def _held(model: CameraModel, names: tuple[str, ...], tolerance_px: float, who: str) -> CameraModel:
-    """The model in a form that goes from object to image and has these parameters, if no more is lost than is allowed."""
-    form = converted(model, "object_to_image", names)
+def held(
+    model: CameraModel, names: tuple[str, ...], tolerance_px: float, who: str, projection: Projection = "perspective"
+) -> CameraModel:
+    """The model in a form that goes from object to image and has these parameters, if no more is lost than is allowed.
+
+    Raises
+    ------
+    InputError
+        Otherwise; it says what ``who`` has no place for.
+    """
+    form = converted(model, "object_to_image", names, projection)
     if form.largest_px <= max(tolerance_px, EXACT_PX):
         return form.model
     lost = [n for n in NAMES if n not in names and model[n]]
     about = [f"{who} has no place for {', '.join(lost)}"] if lost else []
+    if projection != model.projection:
+        about.append(f"{who} is {projection}, this lens is {model.projection}")
     if model.direction == "image_to_object":
         about.append(f"{who} distorts from object to image, this model corrects from image to object")
     enough = np.ceil(100 * form.largest_px / (step := 10.0 ** np.floor(np.log10(form.largest_px)))) / 100 * step  # three digits, upwards

@@ -31,7 +31,7 @@ __all__ = ["StoredCalibration", "calibrate", "read_calibration"]
 
 PROJECT_ENDINGS = (".yaml", ".yml")
 # What is said with pictures, and the keys of a project's ``cameras`` and ``pictures`` that mean the same.
-CAMERA_KEYS = {name: name for name in ("camera", "interface", "direction", "c_mm", "c_px")} | {"pixel_um": "pitch_um"}
+CAMERA_KEYS = {name: name for name in ("camera", "interface", "direction", "projection", "c_mm", "c_px")} | {"pixel_um": "pitch_um"}
 PICTURE_KEYS = {
     **{name: name for name in ("kind", "grid", "polarity", "channel", "raw", "noise")},
     **{f"{name}_mm": name for name in ("pitch", "side", "diameter")},
@@ -61,7 +61,7 @@ def calibrate(
         Folder for ``report.html``, ``calibration.json``, ``points.csv``, ``poses.csv`` and ``residuals.csv`` (of straight lines without
         points and poses), and ``camera.yaml`` where a preset is named (``camera-NAME.yaml`` of several cameras).
     free : sequence of str, optional
-        Interior parameters to estimate, out of c, xp, yp, b1, b2, p1, p2, k1 … k5, in place of what the project says.
+        Interior parameters to estimate, out of c, xp, yp, b1, b2, p1, p2, k1 … k5, d1 … d3, s1 … s4, in place of what the project says.
     per_image : sequence of str, optional
         Out of ``"x_scale"`` and ``"x_shift"``, likewise.
     options : mapping, optional
@@ -74,8 +74,9 @@ def calibrate(
         For pictures: ``kind`` ("chessboard", "dots", "coded", "squares" or "lines"), ``grid`` ("9x6"), ``pitch_mm`` (spacing of the
         targets), ``side_mm``, ``diameter_mm`` (of squares and dots), ``polarity``, ``channel``, ``raw`` ("1920x1200:Mono12p", of files
         without a header), ``noise``; and of the camera: ``camera`` (a preset or camera file, which brings the pitch), ``interface``
-        ("digital" or "analogue": whether a frame grabber samples its lines), ``direction``, ``pixel_um`` (pitch of the pixels), ``c_mm``
-        or ``c_px``; ``rig=True``: the names tell several cameras that stand still against each other, and their instants (left01, right01).
+        ("digital" or "analogue": whether a frame grabber samples its lines), ``direction``, ``projection``, ``pixel_um`` (pitch of the
+        pixels), ``c_mm`` or ``c_px``; ``rig=True``: the names tell several cameras that stand still against each other, and their instants
+        (left01, right01).
 
     Returns
     -------

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from pixmetry.calibrate.bundle.model import NAMES
 from pixmetry.calibrate.bundle.network import Adjustment
 
 
@@ -18,7 +17,7 @@ def parameter_columns(a: Adjustment) -> dict[str, Any]:
         camera = a.camera(k)
         free, covariance = a.interior_covariance(k)
         u = dict(zip(free, np.sqrt(np.diag(covariance)).tolist(), strict=True))
-        for name, value, unit in zip(NAMES, camera.values.tolist(), camera.units, strict=True):
+        for name, value, unit, _ in camera.parameters:
             rows.append((camera.name, name, value, u.get(name, 0.0), unit, name in u))
     return dict(zip(("camera", "parameter", "value", "u", "unit", "estimated"), map(list, zip(*rows, strict=True)), strict=True))
 

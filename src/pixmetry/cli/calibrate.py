@@ -78,6 +78,11 @@ OPTIONS = ("field", "loss", "folds", "residual_grid", "snoop", "a_priori")
     help="Direction of the distortion: corrections to the image (photogrammetry), or distortion of the ideal image (OpenCV). "
     "Default: image_to_object.",
 )
+@click.option(
+    "--projection",
+    type=click.Choice(["perspective", "equidistant", "equisolid", "stereographic", "orthographic"]),
+    help="What the lens would draw without distortion; a fisheye is most often near equidistant. Default: perspective.",
+)
 @click.option("--free", metavar="NAMES", help="Parameters to estimate, such as c,xp,yp,k1,k2. Default: c,xp,yp,b1,b2,p1,p2,k1,k2,k3.")
 @click.option(
     "--per-image",
@@ -111,13 +116,21 @@ OPTIONS = ("field", "loss", "folds", "residual_grid", "snoop", "a_priori")
     help="Take the given uncertainties of image coordinates as true; do not scale them by the residuals.",
 )
 @click.option("--opencv", type=click.Path(path_type=Path), metavar="FILE", help="Also write the camera for OpenCV: .yaml, .xml or .json.")
+@click.option(
+    "--export",
+    "exports",
+    multiple=True,
+    metavar="FORMAT=FILE",
+    help="Also write the cameras for another program: opencv, colmap, ros (camera_info), kalibr (camchain), mrcal, metashape, matlab. "
+    "May be repeated.",
+)
 @click.option("--colmap", type=click.Path(path_type=Path), metavar="FILE", help="Also write the cameras for COLMAP: cameras.txt.")
 @click.option(
     "--may-lose-px",
     type=click.FloatRange(0),
     default=0.0,
     show_default=True,
-    help="Largest error that the export to OpenCV or COLMAP may add anywhere in the frame, px.",
+    help="Largest error that an export may add anywhere in the frame, px.",
 )
 @pdf_option()
 @json_option("the cameras and the findings")
@@ -127,6 +140,7 @@ def calibrate(
     output: Path,
     opencv: Path | None,
     colmap: Path | None,
+    exports: tuple[str, ...],
     may_lose_px: float,
     pdf: Path | None,
     json_file: Path | None,
@@ -139,21 +153,22 @@ def calibrate(
     (files or folders), of a flat test field or of straight lines.
 
     The folder of results gets report.html, calibration.json, residuals.csv, points.csv and poses.csv (straight lines have no points and no
-    poses). An export that OpenCV or COLMAP cannot hold is refused with the reason. The results are written even then.
+    poses). An export that a program cannot hold is refused with the reason. The results and the other exports are written even then.
 
     The exit status is 1 if the image coordinates fit no camera: the results then say why, and are no calibration.
 
     docs/calibrating.md explains every key of a project file and every message.
     """
+    from pixmetry.calibrate.files.exports import check_exports, write_exports
     from pixmetry.calibrate.files.record import LINES_SCHEMA, RESULT_SCHEMA, cameras_text
-    from pixmetry.calibrate.files.write import check_exports, write_exports
     from pixmetry.calibrate.job import calibrate as run
     from pixmetry.cli._progress import shown_progress
     from pixmetry.core.threads import set_threads
 
     set_threads(threads)
     read = (*sources, *((Path(given["camera"]),) if given["camera"] is not None else ()))
-    check_exports(opencv, colmap, output, read)
+    wanted = _wanted(exports, opencv, colmap)
+    check_exports(wanted, output, read)
     check_pdf(pdf, read)
     written = JsonResult(json_file, RESULT_SCHEMA, LINES_SCHEMA, inputs=read)
     options = {name: given.pop(name) for name in OPTIONS}
@@ -165,11 +180,31 @@ def calibrate(
     if not written.printed:
         echo_lines(_summary(calibration, report))
     put_pdf(pdf, lambda: _page_of(calibration))
-    if opencv is not None or colmap is not None:
-        for sentence in write_exports(_models(calibration), opencv, colmap, may_lose_px, read):
+    if wanted:
+        rig = getattr(getattr(calibration, "tests", None), "rig", None)
+        made = write_exports(_models(calibration), wanted, may_lose_px, read, rig)
+        for sentence in made.sentences:
             echo(sentence, err=written.printed)
+        for path, problem in made.refused[1:]:
+            echo(f"{path}: not written: {problem.what}", err=written.printed)
+        if made.refused:
+            raise made.refused[0][1]
     if any(finding.level == "error" for finding in calibration.findings):
         raise click.exceptions.Exit(EXIT_NOT_CALIBRATED)
+
+
+def _wanted(exports: tuple[str, ...], opencv: Path | None, colmap: Path | None) -> dict[str, Path]:
+    """Files by format."""
+    from pixmetry.core.errors import InputError
+
+    found = {name: path for name, path in (("opencv", opencv), ("colmap", colmap)) if path is not None}
+    for text in exports:
+        name, equals, file = text.partition("=")
+        if not equals or not file or name in found:
+            what = "a format twice" if name in found else "not an export"
+            raise InputError(what, where="--export", value=text, allowed="FORMAT=FILE, such as ros=camera.yaml, each format once")
+        found[name] = Path(file)
+    return found
 
 
 def _summary(calibration: Any, report: Path) -> str:

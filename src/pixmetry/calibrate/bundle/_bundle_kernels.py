@@ -80,7 +80,7 @@ def linearise(
     """Whitened residuals (n, 2) and Jacobian (n, 2, q) at a state; NaN and 0 where a point has no image."""
     x, y, whiten = measured
     image, point, camera_of, free, extra = at.image, at.point, at.camera_of, at.free, at.extra
-    interior, direction, per_px = cameras
+    interior, form, per_px = cameras
     rotation, position = views
     x_scale, x_shift, origin = stretches
     xyz, held = points
@@ -100,7 +100,7 @@ def linearise(
         if zc > 1e-9 * (abs(xc) + abs(yc)):
             u, v = xc / zc, yc / zc
             guess = origin + (x[i] - x_shift[m] - origin) / stretch
-            lens = Lens(interior[k], direction[k], per_px[k, 0], per_px[k, 1])
+            lens = Lens(interior[k], form[k], per_px[k, 0], per_px[k, 1])
             px, py = image_point(u, v, lens, guess, y[i], by_direction, by_interior)
             if np.isnan(px):
                 px, py = image_point(u, v, lens, np.nan, np.nan, by_direction, by_interior)

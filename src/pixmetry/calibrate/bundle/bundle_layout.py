@@ -9,7 +9,7 @@ from itertools import compress
 import numpy as np
 
 from pixmetry.calibrate.bundle._bundle_kernels import ELIMINATED, HELD, Incidence
-from pixmetry.calibrate.bundle.model import CODES, NAMES
+from pixmetry.calibrate.bundle.model import NAMES
 from pixmetry.calibrate.bundle.network import PER_IMAGE_NAMES, Network, ScaleBars, State
 from pixmetry.calibrate.bundle.rig import Rig, Ties, rig_of
 from pixmetry.core.arrays import Array, Flags, Ints
@@ -51,8 +51,8 @@ class Layout:
         Between determined points.
     constraints : ndarray, shape (constraints, unknowns)
         Rows of unit length whose product with the reduced unknowns stays 0.
-    direction, per_px : ndarray, shape (cameras,), (cameras, 2)
-        Of the distortion; length units per pixel.
+    form, per_px : ndarray, shape (cameras,), (cameras, 2)
+        Direction of the distortion and projection; length units per pixel.
     rig : Rig, optional
         Images whose poses depend on each other.
     notes : tuple of str
@@ -79,7 +79,7 @@ class Layout:
     prior: Array
     bars: ScaleBars
     constraints: Array
-    direction: Ints
+    form: Ints
     per_px: Array
     rig: Rig | None = None
     notes: tuple[str, ...] = ()
@@ -191,7 +191,7 @@ def layout_of(network: Network, start: State, used: np.ndarray | None) -> Layout
         prior=prior,
         bars=bars,
         constraints=np.array([np.pad(row, (0, len(columns) - len(row))) for row in constraints]).reshape(-1, len(columns)),
-        direction=np.array([CODES[camera.direction] for camera in network.cameras], np.int64),
+        form=np.array([camera.form for camera in network.cameras], np.int64),
         per_px=np.array([camera.sensor.per_px for camera in network.cameras], float),
         rig=rig_of(network, image_there),
         notes=_lost_bars(network, point_there),

@@ -67,7 +67,7 @@ def linearise(layout: Layout, state: State, loss: Loss) -> Linearised:
     """Residuals, Jacobian and weights at a state."""
     n, at = len(layout.x), layout.incidence
     residual, jacobian = np.empty((n, 2)), np.empty((n, 2, at.free.shape[1] + 6 + int((layout.extra >= 0).sum()) + 3))
-    measured, cameras = Measured(layout.x, layout.y, layout.whiten), Cameras(state.interior, layout.direction, layout.per_px)
+    measured, cameras = Measured(layout.x, layout.y, layout.whiten), Cameras(state.interior, layout.form, layout.per_px)
     stretch = Stretch(state.x_scale, state.x_shift_px, float(layout.network.scale_origin_px))
     views, points = Views(state.rotation, state.position), Points(state.xyz, layout.held)
     kernels.linearise(measured, at, cameras, views, stretch, points, residual, jacobian)

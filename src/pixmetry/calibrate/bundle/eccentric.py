@@ -17,7 +17,6 @@ from typing import Literal
 import numpy as np
 
 from pixmetry.calibrate.bundle._model_kernels import Cameras, Outline, Targets, Views, area_centres
-from pixmetry.calibrate.bundle.model import CODES
 from pixmetry.calibrate.bundle.network import Network, State
 from pixmetry.core.arrays import Array
 
@@ -89,8 +88,8 @@ def predicted(network: Network, state: State, rows: np.ndarray, normal: np.ndarr
     image, point = network.image[rows].astype(np.int64), network.point[rows]
     camera = network.camera_of[image].astype(np.int64)
     targets = Targets(image, camera, state.xyz[point], first, np.cross(normal, first), network.diameter[point] / 2)
-    direction = np.array([CODES[camera.direction] for camera in network.cameras], np.int64)
-    cameras = Cameras(state.interior, direction, np.array([camera.sensor.per_px for camera in network.cameras]))
+    form = np.array([camera.form for camera in network.cameras], np.int64)
+    cameras = Cameras(state.interior, form, np.array([camera.sensor.per_px for camera in network.cameras]))
     shift = area_centres(targets, Views(state.rotation, state.position), cameras, outline(shape))
     shift[:, 0] *= 1.0 + state.x_scale[image]
     return shift

@@ -152,7 +152,7 @@ class State:
 
     Parameters
     ----------
-    interior : ndarray, shape (cameras, 12)
+    interior : ndarray, shape (cameras, interior parameters)
         In the order of `pixmetry.calibrate.bundle.model.NAMES`.
     rotation : ndarray, shape (images, 3, 3)
     position : ndarray, shape (images, 3)

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from pixmetry.calibrate.bundle.model import NAMES
 from pixmetry.calibrate.bundle.network import PER_IMAGE, SCALE, SHIFT, Adjustment, Network, State
 from pixmetry.calibrate.bundle.rig import Ties, rig_of
 from pixmetry.core.arrays import Array
@@ -33,7 +34,7 @@ class Derivatives:
     Parameters
     ----------
     computed : ndarray, shape (n, 2)
-    by_interior : ndarray, shape (n, 2, 12)
+    by_interior : ndarray, shape (n, 2, interior parameters)
     by_image : ndarray, shape (n, 2, 8)
         A small rotation about the camera's axes, the projection centre, x-scale, x-shift.
     by_point : ndarray, shape (n, 2, 3)
@@ -51,7 +52,7 @@ def derivatives(network: Network, state: State) -> Derivatives:
     rotation = state.rotation[image]
     inside = np.einsum("nij,nj->ni", rotation, state.xyz[network.point] - state.position[image])
     u, v, depth = inside[:, 0] / inside[:, 2], inside[:, 1] / inside[:, 2], inside[:, 2]
-    computed, by_direction, by_interior = np.empty((n, 2)), np.empty((n, 2, 2)), np.empty((n, 2, 12))
+    computed, by_direction, by_interior = np.empty((n, 2)), np.empty((n, 2, 2)), np.empty((n, 2, len(NAMES)))
     for k, camera in enumerate(network.cameras):
         rows = network.camera_of[image] == k
         x, y, by_direction[rows], by_interior[rows] = replace(camera, values=state.interior[k]).projected(u[rows], v[rows])

@@ -14,15 +14,16 @@ from pixmetry.calibrate.checks.quality import propagated
 from pixmetry.calibrate.records import DistortionCurves, ProjectionMap
 from pixmetry.core.arrays import Array
 
-RADIAL = ("k1", "k2", "k3", "k4", "k5")
+RADIAL, BELOW = ("k1", "k2", "k3", "k4", "k5"), ("d1", "d2", "d3")
 
 
 def distortion_curves(adjustment: Adjustment, balanced_at: float | None = None, points: int = 101) -> dict[str, DistortionCurves]:
     """Radial, balanced and tangential distortion against the radius, from the principal point to the farthest corner.
 
     From image to object these are corrections of the measured radius r: Δr = K1 r³ + K2 r⁵ + …. From object to image they are what the lens
-    adds to the ideal radius r = c tan θ. The balanced form has another principal distance c_b, and the rest as distortion: of the same
-    lens, with Δr_b = (c_b/c)(r + Δr) − r (image to object) or r + Δr − (c_b/c) r. Its band holds c_b, a function of the same parameters.
+    adds to the ideal radius r = c tan θ, or that of the fisheye's projection. The balanced form has another principal distance c_b, and the
+    rest as distortion: of the same lens, with Δr_b = (c_b/c)(r + Δr) − r (image to object) or r + Δr − (c_b/c) r. Its band holds c_b, a
+    function of the same parameters.
 
     Parameters
     ----------
@@ -63,8 +64,11 @@ def radial_distortion(camera: CameraModel, radius: np.ndarray) -> np.ndarray:
     """Δr at a radius, both in the unit of the image plane; see `distortion_curves`."""
     to_image = camera.direction == "object_to_image"
     q = np.asarray(radius, float) / (camera["c"] if to_image else 1.0)
-    delta = sum((camera[name] * q ** (2 * n + 3) for n, name in enumerate(RADIAL)), np.zeros_like(q))
-    return delta * (camera["c"] if to_image else 1.0)
+
+    def polynomial(names: tuple[str, ...]) -> Array:
+        return 1 + sum((camera[name] * q ** (2 * n + 2) for n, name in enumerate(names)), np.zeros_like(q))
+
+    return q * (polynomial(RADIAL) / polynomial(BELOW) - 1) * (camera["c"] if to_image else 1.0)
 
 
 def tangential_distortion(camera: CameraModel, radius: Array) -> Array:

@@ -49,7 +49,7 @@ NAMED = 5
 LEAST_NOTES = 2
 MOST_PATTERNS = 4
 MOST = 8  # findings in all, unless there are more warnings
-RADIAL = frozenset(("k1", "k2", "k3", "k4", "k5"))
+RADIAL = frozenset(("k1", "k2", "k3", "k4", "k5", "d1", "d2", "d3"))
 
 
 def in_order(findings: Iterable[Finding]) -> tuple[Finding, ...]:

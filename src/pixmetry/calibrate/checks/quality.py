@@ -23,7 +23,12 @@ from pixmetry.calibrate.records import (
 )
 from pixmetry.core.arrays import Array
 
-GROUPS = {"radial": ("k1", "k2", "k3", "k4", "k5"), "tangential": ("p1", "p2"), "affinity": ("b1", "b2")}
+GROUPS = {
+    "radial": ("k1", "k2", "k3", "k4", "k5", "d1", "d2", "d3"),
+    "tangential": ("p1", "p2"),
+    "affinity": ("b1", "b2"),
+    "thin prism": ("s1", "s2", "s3", "s4"),
+}
 TESTED = tuple(name for names in GROUPS.values() for name in names)  # 0 means something for these, not for c, xp and yp
 SIGNIFICANT = 0.05
 POSE = ("rx", "ry", "rz", "X0", "Y0", "Z0", *PER_IMAGE_NAMES)

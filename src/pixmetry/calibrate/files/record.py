@@ -187,9 +187,10 @@ def camera_record(model: CameraModel, names: tuple[str, ...], covariance: np.nda
         **asdict(model.sensor),
         "direction": model.direction,
         "interface": model.interface,
+        "projection": model.projection,
         "parameters": [
             {"name": name, "value": value, "u": u.get(name, 0.0), "unit": unit, "free": bool(free)}
-            for name, value, unit, free in zip(NAMES, model.values, model.units, model.free, strict=True)
+            for name, value, unit, free in model.parameters
         ],
         "covariance": {"names": names, "rows": covariance},
     }
@@ -305,9 +306,16 @@ def _stored(record: Mapping[str, Any]) -> StoredCalibration:
 def _camera(record: Mapping[str, Any]) -> CameraModel:
     parameters = record["parameters"]
     sensor = Sensor(*(record[name] for name in ("cols", "rows", "pitch_x_um", "pitch_y_um")))
-    values = np.array([parameter["value"] for parameter in parameters], dtype=float)
+    value = {parameter["name"]: float(parameter["value"]) for parameter in parameters}
+    free = {parameter["name"] for parameter in parameters if parameter["free"]}
     return CameraModel(
-        sensor, record["direction"], values, np.array([p["free"] for p in parameters], dtype=bool), record["name"], record.get("interface")
+        sensor,
+        record["direction"],
+        np.array([value.get(name, 0.0) for name in NAMES]),
+        np.isin(NAMES, list(free)),
+        record["name"],
+        record.get("interface"),
+        record.get("projection", "perspective"),
     )
 
 

@@ -49,6 +49,8 @@ TITLES = {
     "p1": "Decentring",
     "p2": "Decentring",
     **{f"k{n}": "Radial" for n in range(1, 6)},
+    **{f"d{n}": "Radial, denominator" for n in range(1, 4)},
+    **{f"s{n}": "Thin prism" for n in range(1, 5)},
 }
 SHARED = {"image": "in one image", "frame": "at one place of the frame in all images", "view": "in images from similar directions"}
 DIRECTIONS = {
@@ -59,7 +61,7 @@ DIRECTIONS = {
 
 def symbol(name: str) -> str:
     """A parameter's sign as photogrammetry writes it."""
-    return name.upper() if name[0] in "bpk" else name
+    return name.upper() if name[0] in "bpkds" else name
 
 
 def p_text(p: float | None) -> str:

@@ -16,6 +16,7 @@ import numpy as np
 
 from pixmetry.calibrate.bundle.model import NAMES, TEN, CameraModel, Direction, Sensor
 from pixmetry.calibrate.exchange import converted, model_of_colmap, read_opencv, vision_values
+from pixmetry.calibrate.files.imports import read_cameras
 from pixmetry.calibrate.files.record import stored_cameras
 from pixmetry.calibrate.lines.plumb_line import FREE
 from pixmetry.calibrate.project.reader import Reader
@@ -28,9 +29,9 @@ from pixmetry.core.errors import InputError
 from pixmetry.files.files import find_file
 
 Pitch = tuple[float | None, float | None]
-MIRRORED = ("b2", "p2")  # with y the other way round they change their sign, in both directions of the distortion; yp is a place
+MIRRORED = ("b2", "p2", "s3", "s4")  # with y the other way round they change their sign, in both directions; yp is a place
 CLOCK, READ_OUT, WINDOW = "grabber.sampling_clock", "sensor.read_out", "grabber.window_offset"
-ENDINGS = (".json", ".yaml", ".yml", ".xml", ".txt")
+ENDINGS = (".json", ".yaml", ".yml", ".xml", ".txt", ".cameramodel")
 
 
 @dataclass(frozen=True)
@@ -117,14 +118,17 @@ def described(entry: CameraEntry, reader: Reader, k: int, *, straight: bool = Fa
 def _model(entry: CameraEntry, sensor: Sensor, start: CameraModel | None, straight: bool, upwards: bool) -> CameraModel:
     given = entry.model_fields_set
     direction = entry.direction if start is None or "direction" in given else None
-    based = CameraModel.of(sensor, entry.direction) if start is None else on_sensor(start, sensor, direction)
+    based = CameraModel.of(sensor, entry.direction, projection=entry.projection) if start is None else on_sensor(start, sensor, direction)
+    if "projection" in given and based.projection != entry.projection:
+        allowed, remedy = f"projection: {based.projection}", "leave projection or start_from out"
+        raise InputError("start values of another projection", where=entry.name, value=entry.projection, allowed=allowed, remedy=remedy)
     values = {name: getattr(entry, name) for name in NAMES[3:] if name in given}
     values |= {name: -values[name] for name in MIRRORED if upwards and name in values}
     values |= {name: value for name, value in (("xp", entry.xp_px), ("yp", entry.yp_px)) if value is not None}
     c = entry.c_mm if entry.c_mm is not None else entry.c_px * sensor.per_px[0] if entry.c_px is not None else based["c"]
     all_values = dict(zip(NAMES, based.values.tolist(), strict=True)) | values | {"c": c}
     free = entry.free if entry.free is not None else FREE if straight else TEN
-    return CameraModel.of(sensor, based.direction, free, entry.name, **all_values)
+    return CameraModel.of(sensor, based.direction, free, entry.name, based.projection, **all_values)
 
 
 def _interface_of(preset: Camera | None) -> str | None:
@@ -231,14 +235,15 @@ def read_start(path: Path, name: str) -> CameraModel:
         If the file cannot be read, or does not say which camera is meant.
     """
     if path.suffix.lower() not in ENDINGS:
-        allowed = "calibration.json, a file of OpenCV's storage (.yaml, .yml, .xml, .json), or COLMAP's cameras.txt"
+        allowed = "calibration.json, COLMAP's cameras.txt, a file of OpenCV (.yaml, .yml, .xml, .json), ROS, Kalibr, mrcal or Metashape"
         raise InputError("no start values can be read from such a file", where=str(path), value=path.suffix, allowed=allowed)
     if path.suffix.lower() == ".txt":
         lines = [line for line in read_text(path).splitlines() if line.strip() and not line.startswith("#")]
         return _of_name({line.split()[0]: line for line in lines}, name, path, model_of_colmap)
     if path.suffix.lower() == ".json" and _is_ours(path):
         return _of_name({model.name: model for model in stored_cameras(path)}, name, path, lambda model: model)
-    return read_opencv(path)
+    others = read_cameras(path)
+    return _of_name(others, name, path, lambda model: model) if others is not None else read_opencv(path)
 
 
 def _is_ours(path: Path) -> bool:
@@ -272,7 +277,7 @@ def on_sensor(model: CameraModel, sensor: Sensor, direction: Direction | None) -
         what = "start values without a principal distance cannot take another direction or pitch"
         remedy = f"write `direction: {model.direction}`, and the pitch that they were found with"
         raise InputError(what, where=model.name, remedy=remedy)
-    names = (*TEN, *(name for name in ("k4", "k5") if model[name]))
+    names = (*TEN, *(name for name in NAMES if name not in TEN and model[name]))
     if model.sensor.per_px != sensor.per_px:
         seen = converted(model, "object_to_image", names).model
         fx, skew, fy, xp, yp = vision_values(seen)

@@ -77,6 +77,14 @@ class CameraEntry(Model):
     k3: float = 0.0
     k4: float = 0.0
     k5: float = 0.0
+    d1: float = 0.0
+    d2: float = 0.0
+    d3: float = 0.0
+    s1: float = 0.0
+    s2: float = 0.0
+    s3: float = 0.0
+    s4: float = 0.0
+    projection: Literal["perspective", "equidistant", "equisolid", "stereographic", "orthographic"] = "perspective"
     free: Annotated[tuple[Literal[NAMES], ...] | None, BeforeValidator(_listed)] = None  # type: ignore[valid-type]
 
     @model_validator(mode="before")

@@ -34,7 +34,7 @@ def from_poses(network: Network, interior: np.ndarray) -> Reconstruction | None:
     ----------
     network : Network
         Nothing that is known of its object takes part.
-    interior : ndarray, shape (cameras, 12)
+    interior : ndarray, shape (cameras, interior parameters)
         Start values; 0 in place of principal distances that are not known.
 
     Returns

@@ -37,7 +37,7 @@ class Reconstruction:
     Parameters
     ----------
     network : Network
-    interior : ndarray, shape (cameras, 12)
+    interior : ndarray, shape (cameras, interior parameters)
     control : ndarray of bool, shape (points,)
         Points whose coordinates stand; the others are intersected.
     """
