@@ -293,7 +293,7 @@ def colmap_line(model: CameraModel, camera_id: int = 1, kind: str = "FULL_OPENCV
     if kind not in COLMAP:
         raise InputError("no such camera model of COLMAP", where="kind", value=kind, allowed=", ".join(COLMAP))
     projection: Projection = "equidistant" if kind == "OPENCV_FISHEYE" else "perspective"
-    form = held(model, ("c", "xp", "yp", *COLMAP[kind]), tolerance_px, f"COLMAP's {kind}", projection)
+    form = held(model, colmap_names(model, kind), tolerance_px, f"COLMAP's {kind}", projection)
     fx, _, fy, cx, cy = vision_values(form)
     if "b1" not in COLMAP[kind] and abs(fx - fy) * max(form.sensor.cols, form.sensor.rows) > EXACT_PX * fy:
         raise InputError(f"COLMAP's {kind} has one focal length", where=form.name, value=(fx, fy), remedy="take PINHOLE or OPENCV")
@@ -301,6 +301,11 @@ def colmap_line(model: CameraModel, camera_id: int = 1, kind: str = "FULL_OPENCV
     lens = {"OPENCV": ORDER[:4], "FULL_OPENCV": ORDER[:8]}.get(kind, COLMAP[kind])
     numbers = [*focal, cx + 0.5, cy + 0.5, *(form[n] for n in lens if n != "b1")]
     return " ".join([str(camera_id), kind, str(form.sensor.cols), str(form.sensor.rows), *(repr(float(v)) for v in numbers)])
+
+
+def colmap_names(model: CameraModel, kind: str) -> tuple[str, ...]:
+    """Our parameters that a model of COLMAP is to hold: a denominator only if the lens has one."""
+    return ("c", "xp", "yp", *(name for name in COLMAP[kind] if name[0] != "d" or _uses(model, "d")))
 
 
 def model_of_colmap(line: str, pitch_um: tuple[float, float] | None = None) -> CameraModel:

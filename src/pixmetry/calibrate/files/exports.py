@@ -22,11 +22,11 @@ import numpy as np
 from pixmetry import __version__
 from pixmetry.calibrate.bundle.model import CameraModel
 from pixmetry.calibrate.exchange import (
-    COLMAP,
     EXACT_PX,
     STORAGES,
     Converted,
     colmap_line,
+    colmap_names,
     converted,
     held,
     opencv_form,
@@ -224,7 +224,7 @@ def _simplest(model: CameraModel) -> tuple[str, Converted]:
         return "OPENCV_FISHEYE", _found("COLMAP", model)
     found = None
     for kind in COLMAP_KINDS:
-        found = converted(model, "object_to_image", ("c", "xp", "yp", *COLMAP[kind]))
+        found = converted(model, "object_to_image", colmap_names(model, kind))
         if found.largest_px <= EXACT_PX:
             return kind, found
     assert found is not None
