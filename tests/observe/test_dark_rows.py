@@ -87,6 +87,15 @@ def test_a_hum_above_half_the_line_rate_is_unfolded_by_its_turn_along_the_row(rn
     assert abs(found.value - (1e6 / LINE_US - 32000.0)) < 6 * found.u and "look the same" in found.reason
 
 
+def test_a_hum_is_no_white_noise_within_the_rows(rng: np.random.Generator):
+    """15 kHz turn by 0.3 within a row of 20 µs: a quarter of the hum's variance is about the means of the rows."""
+    seen = seen_of(rng, hum_dn=3.0, hertz=15000.0)
+    square, u = seen.dark_rows.taken["pixel"]
+    assert abs(square - 3.0**2 / 2 * (1 - np.sinc(15000.0 * SHAPE[1] / 8e6) ** 2)) < 6 * u < 0.5
+    white = measure_sources(seen)[0]["electronics.amplifier_noise"]["white_e"]
+    assert abs(white.value - READ_E) < 6 * white.u
+
+
 def test_mains_of_a_fraction_of_a_cycle_a_frame_are_found_where_frames_follow_each_other(rng: np.random.Generator):
     """107 Hz over frames of 3 ms, 40 ms apart, beside 1/f noise or not."""
     for flicker in (0.0, 0.7):
@@ -115,6 +124,8 @@ def test_one_over_f_noise_is_found_and_taken_off_white_and_row_noise(rng: np.ran
     assert "line_px" not in found.reasons
     unclocked = measure_sources(seen_of(rng, flicker_dn=3.0, stack=8, facts={}))[0]["electronics.flicker_noise"]
     assert "state camera.line_time_us" in unclocked.reasons["line_px"]
+    # lines may be up to twice as long as their pixels
+    assert abs(unclocked["line_px"].value - LINE_US * 8.0) < 3**0.5 * unclocked["line_px"].u
 
 
 def test_without_hum_and_one_over_f_there_are_limits(rng: np.random.Generator):

@@ -49,11 +49,11 @@ class DarkRows:
         ``amplitude_dn``, ``per_row``, ``per_col`` (cycles), ``frequency_hz`` where the clocks were stated; or the reasons.
     flicker : Estimates
         ``rms_dn``, ``corner_rel`` with the octaves among the settings; or the reason.
-    line_px : float
-        Pixel clocks from line to line that the fit rests on.
+    line_px, u_line_px : float
+        Pixel clocks from line to line that the fit rests on; their u, 0 where the clocks were stated.
     taken : mapping
         Variance in DN² and its u: by ``hum`` what that gives to the means of the rows, by ``row`` what 1/f noise gives to them, by
-        ``pixel`` what it gives to the pixels within them.
+        ``pixel`` what both give to the pixels within them.
     """
 
     frames: int
@@ -65,6 +65,7 @@ class DarkRows:
     hum: Estimates
     flicker: Estimates
     line_px: float
+    u_line_px: float
     taken: Mapping[str, tuple[float, float]]
 
 

@@ -23,6 +23,7 @@ BINS = 40  # of the spectrum along the rows, evenly in the logarithm
 CORNERS = np.geomspace(0.004, 0.45, 14)
 LEAST_TURNS = 2.5  # of the corner along a row, for 1/f noise that shows in its spectrum
 TYPICAL_CORNER = 0.1  # for which a limit holds
+LONGEST_LINE = 2.0  # pixel clocks from line to line over the pixels of a row, where the clocks are not stated: evenly from 1 to this
 LEAST_WAVE = 12.0  # power of a wave over that of the noise of its column of the spectrum
 LEAST_FIXED_WAVE = 40.0  # the same in the mean of the frames, of which there is one only
 TWO_FIELDS = 1.25  # by which two fields must explain more than one frame
@@ -66,8 +67,7 @@ def reduce_dark_rows(
     power = np.abs(np.fft.rfft(rest, axis=1)) ** 2 / shape[0]
     frequency = np.arange(power.shape[1]) / shape[0]
     power = power.mean(axis=0)
-    clocks = stated.line_time_us and stated.pixel_clock_mhz
-    line_px = max(float(stated.line_time_us or 0) * float(stated.pixel_clock_mhz or 0) if clocks else shape[1], float(shape[1]))
+    line_px, u_line_px = _line_px(stated, shape[1])
     taken: dict[str, tuple[float, float]] = {"hum": (0.0, 0.0), "row": (0.0, 0.0), "pixel": (0.0, 0.0)}
     if line is not None:
         taken["hum"] = (line[0] ** 2 / 2, line[0] * line[1])
@@ -77,14 +77,50 @@ def reduce_dark_rows(
         why = f"the frames are filtered ({noise_filter.name}), and their spectrum with them"
         flicker, fitted = replace(Estimates.empty(), reasons={"rms_dn": why}), np.full_like(power, np.nan)
     else:
-        flicker, fitted, parts = _flicker_of(spectra, power, lines, (len(whole), *shape), line_px, turn)
+        size = (len(whole), *shape)
+        flicker, fitted, parts = _flicker_of(spectra, power, lines, size, line_px, turn)
+        if u_line_px and parts:
+            flicker, parts = _of_any_line(flicker, parts, *_flicker_of(spectra, power, lines, size, line_px + u_line_px, turn)[::2])
         taken |= parts
-    return DarkRows(len(whole), *shape, frequency, power, fitted, hum, flicker, line_px, taken)
+    if line is not None and "per_col" in hum:
+        within = _within_rows(hum, shape[1])
+        taken["pixel"] = taken["pixel"][0] + within[0], float(np.hypot(taken["pixel"][1], within[1]))
+    return DarkRows(len(whole), *shape, frequency, power, fitted, hum, flicker, line_px, u_line_px, taken)
+
+
+def _line_px(stated: StatedFacts, cols: int) -> tuple[float, float]:
+    """Pixel clocks from line to line, and their u: none where the clocks are stated."""
+    if stated.line_time_us and stated.pixel_clock_mhz:
+        return max(stated.line_time_us * stated.pixel_clock_mhz, float(cols)), 0.0
+    return 0.5 * (1 + LONGEST_LINE) * cols, (LONGEST_LINE - 1) / float(np.sqrt(12)) * cols
+
+
+def _of_any_line(
+    flicker: Estimates, parts: dict[str, tuple[float, float]], other: Estimates, of_other: dict[str, tuple[float, float]]
+) -> tuple[Estimates, dict[str, tuple[float, float]]]:
+    """1/f noise and what it gives to rows and pixels, with the change by one u of the line's length in their u."""
+    if not of_other:
+        return flicker, parts
+    change = other.values - flicker.values
+    wider = {name: (value, float(np.hypot(u, of_other[name][0] - value))) for name, (value, u) in parts.items()}
+    return replace(flicker, covariance=flicker.covariance + np.outer(change, change)), wider
 
 
 def _turns_along(hum: Estimates) -> float:
     """Cycles per column of a hum."""
     return abs(hum["per_col"].value)
+
+
+def _within_rows(hum: Estimates, cols: int) -> tuple[float, float]:
+    """Variance that a hum gives to the pixels about the means of their rows, and its u."""
+    amplitude, per_col = hum["amplitude_dn"], hum["per_col"]
+
+    def of(size: float, turns: float) -> float:
+        return float(size**2 / 2 * (1 - np.sinc(turns * cols) ** 2))
+
+    at = abs(per_col.value)
+    square = of(amplitude.value, at)
+    return square, float(np.hypot(of(amplitude.value + amplitude.u, at) - square, of(amplitude.value, at + per_col.u) - square))
 
 
 def without_hum(patterns: PatternList | None, rows: DarkRows | None, spectra: Spectra | None) -> PatternList | None:

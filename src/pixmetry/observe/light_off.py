@@ -13,6 +13,8 @@ from pixmetry.core.errors import MeasureError
 from pixmetry.core.number import ONE_SIDED_95, Estimates
 from pixmetry.observe.experiment import PictureGroup
 from pixmetry.observe.noise_covariance import FrameSuccession, white_square
+from pixmetry.observe.photon_transfer_levels import core_spread_dn2
+from pixmetry.observe.photon_transfer_model import rounding_error_vars
 
 BLOCK_PX = 8
 SETTLED = 4  # dark frames after the step that may hold what the light left; the later ones are the reference
@@ -56,9 +58,11 @@ class BlockMeans:
 def reduce_light_off(groups: Sequence[PictureGroup], seen: Observations) -> Observations:
     """Find the step of every sequence, and the share of the last bright frame that the first dark one still shows."""
     steps, refused = [], []
+    dnl = 0.0 if seen.code_errors is None or "dnl_rms_lsb" not in seen.code_errors.fit else seen.code_errors.fit["dnl_rms_lsb"].value
+    spread = core_spread_dn2(seen.dark_stack)
     for number, group in enumerate(groups, start=1):
         try:
-            steps.append(step_of(group))
+            steps.append(step_of(group, dnl, spread))
         except MeasureError as problem:
             refused.append(f"sequence {number} of {len(groups)}: {problem.what}" + (f" ({problem.remedy})" if problem.remedy else ""))
     bend = seen.bend_rel(max((s.signal_dn for s in steps), default=0.0))
@@ -66,8 +70,8 @@ def reduce_light_off(groups: Sequence[PictureGroup], seen: Observations) -> Obse
     return replace(seen, light_off=found, notes=(*seen.notes, *(f"Light that goes off: {why}" for why in refused)))
 
 
-def step_of(group: PictureGroup) -> LightStep:
-    """The step of one sequence.
+def step_of(group: PictureGroup, dnl_lsb: float = 0.0, spread_dn2: float = 0.0) -> LightStep:
+    """The step of one sequence, behind a converter whose code widths scatter so, with pixels whose dark values differ by so much.
 
     Raises
     ------
@@ -108,7 +112,9 @@ def step_of(group: PictureGroup) -> LightStep:
     common2 = max(float(np.var(shares[SETTLED:], ddof=1)) - white * spread, 0.0)
     least = 1 / 12 / BLOCK_PX**2  # of the rounding, where there is no noise
     own = [max(float(np.var(left[k] - shares[k] * signal, ddof=1)), least) for k in (0, 1)]
-    u = [float(np.sqrt(v * spread + common2 * (1 + 1 / n))) for v in own]
+    converter = _Converter(float(white * BLOCK_PX**2) + spread_dn2, dnl_lsb)
+    steps2 = [float(converter.covariance_dn2(np.array([shares[k] * signal.mean()]))[0, 0]) / float(signal.mean()) ** 2 for k in (0, 1)]
+    u = [float(np.sqrt(v * spread + common2 * (1 + 1 / n) + of_steps)) for v, of_steps in zip(own, steps2, strict=True)]
     memory, u_memory = _noise_memory(sums, last + 1 + SETTLED, group.moments.shape)
     levels, means, covariance = _levels(signal, left[0], own[0], common2 * (1 + 1 / n) / float(weights.sum()) ** 2)
     return LightStep(
@@ -121,8 +127,24 @@ def step_of(group: PictureGroup) -> LightStep:
         u_noise_correlation=u_memory,
         levels_dn=levels,
         left_dn=means,
-        left_covariance_dn2=covariance,
+        left_covariance_dn2=covariance + converter.covariance_dn2(means),
     )
+
+
+@dataclass(frozen=True)
+class _Converter:
+    """A converter's error of the mean of many values, that scatter by ``variance_dn2`` over codes of unequal width."""
+
+    variance_dn2: float
+    dnl_lsb: float
+
+    def covariance_dn2(self, raised_dn: np.ndarray) -> np.ndarray:
+        """Of the errors of levels that are raised so much over black, less that of black: errors e^(−d²/4σ²) alike a distance d apart."""
+        var = float(rounding_error_vars(np.array(self.variance_dn2), 0.0, self.dnl_lsb)[0])
+        four = 4 * max(self.variance_dn2, 1 / 12)
+        alike = np.exp(-((raised_dn[:, None] - raised_dn) ** 2) / four)
+        black = np.exp(-(raised_dn**2) / four)
+        return var * (alike - black[:, None] - black + 1)
 
 
 def _levels(signal: np.ndarray, left: np.ndarray, block_var: float, common_var: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -56,7 +56,7 @@ def measure(observations: Observations) -> Estimates:
     rows = observations.dark_rows
     if rows is not None and fit is not None and "gain_dn_per_e" in fit:
         square, u = (v / fit["gain_dn_per_e"].value ** 2 for v in rows.taken["pixel"])
-        noise = without_variance(noise, "white_e", square, u, "1/f noise, which is measured by itself,")
+        noise = without_variance(noise, "white_e", square, u, "hum or 1/f noise, which is measured by itself,")
     if found is None or fit is None or series is None or not found.moving.any() or noise.limits:
         return noise
     return _without_moving_waves(noise, fit["gain_dn_per_e"].value, found, series.dark.n_frames)

@@ -92,9 +92,9 @@ def measure(observations: Observations) -> Estimates:
     found = told.scaled({"rms_dn": (1 / gain.value, "e-")}).select({"rms_e": "rms_dn", **{n: n for n in told.names if n != "rms_dn"}})
     covariance = found.covariance.copy()
     covariance[0, 0] += (found.values[0] * gain.u / gain.value) ** 2
-    stated = observations.stated.line_time_us and observations.stated.pixel_clock_mhz
-    why = {} if stated else {"line_px": "taken for the pixels of a row: state camera.line_time_us and pixel_clock_mhz"}
-    line = Estimates.from_rows([("line_px", rows.line_px, 0.0, np.inf, "px")], reasons=why)
+    assumed = "assumed, from one to two times the pixels of a row: state camera.line_time_us and pixel_clock_mhz"
+    why = {"line_px": assumed} if rows.u_line_px else {}
+    line = Estimates.from_rows([("line_px", rows.line_px, rows.u_line_px, np.inf, "px")], reasons=why)
     return replace(found, covariance=covariance).join(line)
 
 
