@@ -10,6 +10,7 @@ import numpy as np
 
 from pixmetry.calibrate.bundle.network import Adjustment
 from pixmetry.calibrate.bundle.rig import RelativePoses, relative_poses
+from pixmetry.calibrate.bundle.shared_errors import with_shared_errors
 from pixmetry.calibrate.records import EpipolarRecord, RigCamera, RigidTest, RigRecord
 from pixmetry.core.errors import MeasureError
 from pixmetry.core.finding import Finding
@@ -133,8 +134,9 @@ def _rays(adjustment: Adjustment, k: int, rows: np.ndarray) -> tuple[np.ndarray,
 def rigid_test(adjustment: Adjustment) -> RigidTest | None:
     """Whether the cameras stood still against each other: the network adjusted again with a pose of its own for each image.
 
-    F is what the poses of their own explain, over the rest; the scatter of the relative poses says how large the motion would be. None
-    where an image alone does not determine its pose, or there is one instant.
+    F is what the poses of their own explain, over the rest. Where image points share errors, these let single poses differ too: then F is
+    of the differences of the relative poses from their mean by their joint covariance, with the shared errors in it. The scatter of the
+    relative poses says how large the motion would be. None where an image alone does not determine its pose, or there is one instant.
     """
     from scipy.spatial.transform import Rotation
     from scipy.stats import f as distribution
@@ -149,10 +151,12 @@ def rigid_test(adjustment: Adjustment) -> RigidTest | None:
     more = adjustment.dof - alone.dof
     if more <= 0 or alone.dof <= 0 or (alone.used != adjustment.used).any():
         return None
-    f = max(0.0, (adjustment.cost[-1] - alone.cost[-1]) / more) / (alone.cost[-1] / alone.dof)
+    f, rest = max(0.0, (adjustment.cost[-1] - alone.cost[-1]) / more) / (alone.cost[-1] / alone.dof), float(alone.dof)
+    alone = with_shared_errors(alone) if adjustment.shared is not None and adjustment.shared.found else alone
     places = {name: i for i, name in enumerate(alone.free_columns)}
     turns, shifts, noise, worst = [], [], [], (0.0, "")
-    for _, _, images in _pairs(adjustment):
+    errors, slopes, group = [], [], []
+    for number, (_, _, images) in enumerate(_pairs(adjustment)):
         for i, j in images:
             free, rig = ((_between(one.rotation, one.position, i, j)) for one in (alone.state, state))
             turn = Rotation.from_matrix(free[0] @ rig[0].T).as_rotvec()
@@ -161,21 +165,45 @@ def rigid_test(adjustment: Adjustment) -> RigidTest | None:
             C = J @ alone.covariance[np.ix_(columns, columns)] @ J.T
             error = np.concatenate([turn, free[1] - rig[1]])
             distance = float(error @ np.linalg.solve(C, error))
+            errors.append(error)
+            slopes.append((columns, J))
+            group.append(number)
             worst = max(worst, (distance, network.images[j]))
             turns.append(turn @ turn)
             shifts.append(error[3:] @ error[3:])
             noise.append((np.trace(C[:3, :3]), np.trace(C[3:, 3:])))
     expected = np.sqrt(np.mean(noise, axis=0))
+    if alone.shared is not None and alone.shared.found:
+        f, rest = _scatter(np.concatenate(errors), slopes, np.array(group), alone, more)
     return RigidTest(
         f=float(f),
-        dof=(more, alone.dof),
-        p=float(distribution.sf(f, more, alone.dof)),
+        dof=(more, round(rest)),
+        p=float(distribution.sf(f, more, rest)),
         scatter=float(np.sqrt(np.mean(shifts))),
         expected=float(expected[1]),
         scatter_deg=float(np.rad2deg(np.sqrt(np.mean(turns)))),
         expected_deg=float(np.rad2deg(expected[0])),
         worst=worst[1],
     )
+
+
+def _scatter(
+    errors: np.ndarray, slopes: list[tuple[list[int], np.ndarray]], group: np.ndarray, alone: Adjustment, dof: int
+) -> tuple[float, float]:
+    """Square of differences of relative poses (6 each) from the mean of their pair of cameras, by their joint covariance, over its degrees
+    of freedom; and those of the covariance."""
+    assert alone.shared is not None
+    whole = np.zeros((len(errors), len(alone.covariance)))
+    for i, (columns, J) in enumerate(slopes):
+        whole[6 * i : 6 * i + 6, columns] = J
+    C = whole @ alone.covariance @ whole.T
+    size = np.sqrt(np.diag(C))
+    weight = np.linalg.pinv(C / np.outer(size, size), rcond=1e-9, hermitian=True)
+    mean = np.kron(group[:, None] == np.unique(group), np.eye(6)) / size[:, None]
+    left = errors / size
+    left = left - mean @ np.linalg.lstsq(mean.T @ weight @ mean, mean.T @ weight @ left, rcond=None)[0]
+    taken = np.flatnonzero(whole.any(axis=0))
+    return float(left @ weight @ left) / dof, float(np.mean(alone.shared.dof[taken]))
 
 
 def _between(rotation: np.ndarray, position: np.ndarray, i: int, j: int) -> tuple[np.ndarray, np.ndarray]:

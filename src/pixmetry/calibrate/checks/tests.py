@@ -82,7 +82,7 @@ def tests_of(
         projection=curves.projection_maps(stated),
         shared_errors=quality.shared_records(stated),
         network=network_record(adjustment, _stated(faults, "scale_bars"), a_priori=a_priori),
-        rig=rig_record(adjustment),
+        rig=rig_record(stated),
         known=replace(known_record(adjustment, faults, a_priori=a_priori), fixed_points=fixed_record(adjustment, adjust)),
     )
 
