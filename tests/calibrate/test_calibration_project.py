@@ -110,6 +110,8 @@ def test_columns_by_their_names_or_their_order(tmp_path: Path) -> None:
 def test_covariances_in_pixels_and_millimetres(tmp_path: Path) -> None:
     px = network(tmp_path, "observations: o.csv\n", o=rows("image,point,x_px,y_px,u_x_px,u_y_px", lambda x, y: (x, y, 0.03, 0.05)))
     assert np.allclose(px.covariance_px2, [9e-4, 0, 25e-4]) and px.covariance_known
+    both = network(tmp_path, "observations: o.csv\n", o=rows("image,point,x_px,y_px,u_px", lambda x, y: (x, y, 0.03)))
+    assert np.allclose(both.covariance_px2, [9e-4, 0, 9e-4]) and both.covariance_known
     header = "image,point,x_mm,y_mm,var_x_mm2,cov_xy_mm2,var_y_mm2"
     mm = network(tmp_path, "observations: o.csv\n", o=rows(header, lambda x, y: (0.1, 0.2, 1e-8, 5e-9, 4e-8)))
     # y turns round, so the covariance does; 5 µm and 6 µm a pixel
@@ -254,6 +256,7 @@ def test_a_mistake_in_the_project_is_told(tmp_path: Path, project: str, words: t
         (rows("image,point,x_px,y_mm"), ("several units",)),
         (rows("image,point,x_px,y_px,u_x_px,u_y_px", lambda x, y: (x, y, 0.1, 0.0)), ("line 2", "u_y_px", "above 0")),
         (rows("image,point,x_px,y_px,u_x", lambda x, y: (x, y, 0.1)), ("u_x", "unknown kind", "u_x_px")),
+        (rows("image,point,x_px,y_px,std_px", lambda x, y: (x, y, 0.1)), ("std_px", "unknown kind", "u_px")),
         (rows("image,point,x_px,y_px,var_x_px2,cov_xy_px2,var_y_px2", lambda x, y: (x, y, 1, 1, 1)), ("line 2", "determinant")),
     ],
 )

@@ -218,6 +218,21 @@ def test_drift_of_the_clock_is_named_and_gone_when_estimated(rng):
     assert stats.chi2.ppf(RATE, settled.dof) < settled.sigma0**2 * settled.dof < stats.chi2.isf(RATE, settled.dof)
 
 
+def test_images_that_are_sheared_as_much_as_they_are_stretched_show_no_clock(rng):
+    """A board that moves or bends deforms its images in all ways: the scale of x then is one of them, and no frame grabber is named."""
+    simulated, exact = network_of(rng, images=16, points=60)
+    stretch, shear = 1e-3 * rng.standard_normal((2, 16))
+    off = exact - np.array(SENSOR.centre)
+    image = simulated.network.image
+    network = shifted(measured_again(rng, simulated, exact), stretch[image] * off[:, 0] + shear[image] * off[:, 1])
+    patterns = residual_patterns(adjusted(network, simulated))
+    record = next(one for one in patterns if one.name == "x_scale_by_image")
+    assert record.significant and record.p_alike > 1e-6  # the fifteen of each are drawn alike: F is as of 15 and 15 degrees of freedom
+    if record.p_alike > 0.01:
+        assert not any(cause.endswith("grabber.clock_warm_up") for cause in record.causes)
+        assert "x_scale_drift" not in {finding.kind for finding in pattern_findings([record])}
+
+
 def test_findings_come_with_a_source_of_the_catalogue():
     known = set(sources())
     assert {source for _, source, _ in MEANING.values() if source} <= known

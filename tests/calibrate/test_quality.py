@@ -95,6 +95,20 @@ def test_residual_records_in_both_units(rng):
     assert no_pitch.rms_x_um is None and no_pitch.rms_x_px == record.rms_x_px
 
 
+def test_one_image_point_that_is_known_to_be_poor_is_not_the_headline(rng):
+    """Of 600 coordinates of 0.02 px one has a stated 26 px, and is off by as much: typical is 0.02 px (to six standard deviations)."""
+    sigma = np.full((600, 2), 0.02)
+    sigma[7] = 26.0
+    residual = sigma * rng.standard_normal(sigma.shape)
+    residual[7] = 26.0, -26.0
+    covariance = np.stack([sigma[:, 0] ** 2, 0 * sigma[:, 0], sigma[:, 1] ** 2], axis=1)
+    record = quality.residual_records(by_hand(residual, covariance, np.ones((600, 2))))["camera"]
+    assert record.rms_x_px > 1 and record.rms_y_px > 1
+    for axis in "xy":
+        assert record.typical[axis].rms_px == pytest.approx(0.02, rel=6 / np.sqrt(1200))
+        assert record.typical[axis].rms_um == pytest.approx(3.45 * record.typical[axis].rms_px)
+
+
 def test_records_read_the_covariance(rng):
     made = by_hand(rng.standard_normal((50, 2)), np.tile([1.0, 0, 1], (50, 1)), np.ones((50, 2)))
     made = replace(made, state=replace(made.state, interior=made.network.cameras[0].with_values(b1=2e-5).values[None]))

@@ -79,6 +79,17 @@ def residuals(x: np.ndarray, y: np.ndarray, dx: np.ndarray, dy: np.ndarray, imag
     return Residuals(x, y, dx, dy, np.zeros(len(x), int) if image is None else image, Sensor(1000, 800))
 
 
+def test_a_principal_point_that_is_held_is_said_and_not_a_projection_of_nothing(whole: Calibration) -> None:
+    """Without xp and yp nothing that is estimated moves the middle of the frame: 0 px there would be taken for certainty."""
+    (name, known), *_ = whole.tests.projection.items()
+    u = known.u_px.copy()
+    u[u.shape[0] // 2, u.shape[1] // 2] = 1e-9
+    held = replace(whole, tests=replace(whole.tests, projection={name: replace(known, u_px=u)}))
+    text = worth(held, 0)
+    assert "principal point, which is held" in text and "middle of the frame" not in text
+    assert "middle of the frame" in worth(whole, 0)
+
+
 @pytest.mark.usefixtures("undrawn")
 def test_the_verdict_comes_first_in_px_and_um(whole: Calibration, rng: np.random.Generator) -> None:
     """0.03 and 0.05 px of 5.5 µm pixels are 0.165 and 0.275 µm."""

@@ -248,6 +248,9 @@ class CameraResiduals:
         rms that the given covariances alone would leave, √(Σ r s² / n); None where they were a guess.
     systematic_x_px, systematic_y_px : float or None
         What is left over besides (`pixmetry.calibrate.checks.residual_grid.systematic_rest`).
+    typical_x_px, typical_y_px : float or None
+        rms of the residuals over their uncertainties, times the median of these: the rms where all are alike, and not that of a few image
+        points that are known to be poor.
     """
 
     n: int
@@ -261,6 +264,19 @@ class CameraResiduals:
     noise_y_px: float | None = None
     systematic_x_px: float | None = None
     systematic_y_px: float | None = None
+    typical_x_px: float | None = None
+    typical_y_px: float | None = None
+
+    @property
+    def typical(self) -> dict[Axis, AxisResidual]:
+        """What a typical image point leaves, axis by axis; the rms where the record is without it."""
+        return {axis: self._typical(one, getattr(self, f"typical_{axis}_px")) for axis, one in self.axes.items()}
+
+    @staticmethod
+    def _typical(one: AxisResidual, px: float | None) -> AxisResidual:
+        if px is None or not one.rms_px > 0:
+            return one
+        return AxisResidual(px, None if one.rms_um is None else one.rms_um * px / one.rms_px, one.dof)
 
     @property
     def axes(self) -> dict[Axis, AxisResidual]:
@@ -544,7 +560,7 @@ class AxisComponent:
     Parameters
     ----------
     sigma_px, u_sigma_px : float
-        rms over the image points.
+        Of a typical image point: the median.
     given_px : float
         As given before.
     beyond_px, u_beyond_px : float or None
@@ -804,6 +820,9 @@ class Pattern:
         The pattern beside which it explains least, where it explains too little beside those chosen for its number of terms; empty: none.
     left : bool
         Whether it is nevertheless significant beside those chosen: they do not explain all of it.
+    p_alike : float or None
+        Of a scale of x for each image: how often chance alone makes it explain so much more than a shear of each image, which no clock
+        makes; None of other patterns.
     """
 
     name: str
@@ -824,6 +843,7 @@ class Pattern:
     behind: str = ""
     left: bool = False
     confirmed: bool = False
+    p_alike: float | None = _if_made()
 
     @property
     def alone(self) -> str | None:

@@ -27,6 +27,7 @@ DRIFT = ("x_scale_trend", "x_scale_by_image")
 WORST = 5.0  # times the median rms: what a rejected image point counts at most
 OUTSTANDING = 2.5  # times the median rms of the images: such an image is looked at by itself
 RARE = 0.001
+RARE_ALIKE = 0.01  # level at which a scale of x explains more than a shear
 ALIKE = 0.001  # level at which images differ, but for one of them
 FEW_OF = 3  # they are no more than one image in so many
 NAMED = 5
@@ -206,6 +207,9 @@ def _worded(found: Pattern, places: Mapping[str, Place], interface: str | None) 
     causes = tuple(dict.fromkeys((*causes_of(found.name, source, interface), *rivals)))
     if interface == "digital" and source.startswith("grabber."):
         advice = ON_DIGITAL_ADVICE
+    if found.p_alike is not None and found.p_alike > RARE_ALIKE and interface != "analogue":
+        causes = tuple(cause for cause in causes if not cause.source.startswith("grabber."))
+        advice = "see that nothing moves while a picture is taken, and that the board is stiff; a shear of the images is as large as this"
     if found.alone:
         what, causes = f"{what}, but only that of {found.alone} differs from all others", ()
         advice = "check this image: focus, movement, light, names of points"
@@ -238,6 +242,11 @@ def searched_without_bad_images(adjustment: Adjustment, adjust: Callable[..., Ad
     return replace(again, patterns=patterns)
 
 
+def _of_a_clock(one: Pattern) -> bool:
+    """Whether a scale of x may be a grabber's: not of one image alone, of a digital camera, or beside a shear of the images as large."""
+    return not one.alone and one.source.startswith("grabber.") and (one.p_alike is None or one.p_alike < RARE_ALIKE)
+
+
 def pattern_findings(patterns: Sequence[Pattern]) -> tuple[Finding, ...]:
     """A warning for each significant pattern, the surest first; what another one explains is said with that."""
     several = len({one.camera for one in patterns}) > 1
@@ -248,7 +257,7 @@ def pattern_findings(patterns: Sequence[Pattern]) -> tuple[Finding, ...]:
         if one.outstanding:
             out.append(_bad_images(one.outstanding, where))
             continue
-        kind = "x_scale_drift" if one.name in DRIFT and not one.alone else one.name
+        kind = "x_scale_drift" if one.name in DRIFT and _of_a_clock(one) else one.name
         if one.behind and not (kind == "x_scale_drift" and one.behind in DRIFT):
             continue
         caused = f" ({words})" if (words := cause_words(one)) else ""
@@ -394,7 +403,8 @@ def _over_images(seen: _Seen, dx: np.ndarray, dy: np.ndarray) -> Iterator[_Teste
     if "x_scale" not in network.per_image:
         if last > first:
             yield _trend(seen, "x_scale_trend", seen.along(time * from_origin, None), edge)
-        yield _by_image(seen, "x_scale_by_image", images, from_origin[:, 0])
+        middle = (sensor.rows - 1) / 2
+        yield _by_image(seen, "x_scale_by_image", images, from_origin[:, 0], alike=seen.y - middle)
     if "x_shift" not in network.per_image:
         yield _by_image(seen, "x_shift_by_image", images, np.ones(len(dx)))
     if last > first:
@@ -413,12 +423,16 @@ def _trend(seen: _Seen, name: str, columns: np.ndarray, edge_px: float) -> _Test
     return seen.tested(name, size * edge_px, u * edge_px, found.p, columns)
 
 
-def _by_image(seen: _Seen, name: str, images: np.ndarray, x: np.ndarray) -> _Tested:
-    """A value for each image, of sum 0: what is common to all belongs to affinity and principal point."""
-    from scipy import sparse
+def _by_image(seen: _Seen, name: str, images: np.ndarray, x: np.ndarray, alike: np.ndarray | None = None) -> _Tested:
+    """A value for each image, of sum 0: what is common to all belongs to affinity and principal point; ``alike``: displacements of x that
+    the same images would show if something else deformed them."""
+    from scipy import sparse, stats
 
-    rows = 2 * np.flatnonzero(seen.mine)
-    columns = sparse.csr_matrix((x, (rows, np.searchsorted(images, seen.image))), shape=(2 * len(seen.mine), len(images)))
+    def of(values: np.ndarray) -> Any:
+        rows = 2 * np.flatnonzero(seen.mine)
+        return sparse.csr_matrix((values, (rows, np.searchsorted(images, seen.image))), shape=(2 * len(seen.mine), len(images)))
+
+    columns = of(x)
     contrasts = np.linalg.svd(np.eye(len(images)) - 1 / len(images))[0][:, :-1]
     found = seen.terms.test(columns, contrasts)
     u = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", contrasts, found.covariance, contrasts), 0.0))
@@ -426,7 +440,11 @@ def _by_image(seen: _Seen, name: str, images: np.ndarray, x: np.ndarray) -> _Tes
     alone = int(np.argmax(np.abs(values) / np.maximum(u, 1e-300)))
     by_image = ByImage(names, values, u, names[alone] if _alone(values, u, alone, found.dof) else None)
     steps = columns[:, :-1] - columns[:, 1:]  # of sum 0 too, and sparse
-    return seen.tested(name, _visible(seen, found, columns), None, found.p, steps, by_image=by_image)
+    p_alike = None
+    if alike is not None:
+        other = seen.terms.test(of(alike), contrasts)
+        p_alike = float(stats.f.sf(found.f / max(other.f, 1.0), max(found.k, 1), max(other.k, 1)))
+    return seen.tested(name, _visible(seen, found, columns), None, found.p, steps, by_image=by_image, p_alike=p_alike)
 
 
 def _alone(values: np.ndarray, u: np.ndarray, one: int, dof: float) -> bool:

@@ -186,7 +186,12 @@ def residual_records(adjustment: Adjustment) -> dict[str, CameraResiduals]:
         rms = np.sqrt(np.mean(adjustment.residual_px[rows] ** 2, axis=0)) if rows.any() else np.full(2, np.nan)
         dof = redundancy[rows].sum(axis=0)
         um = (rms * 1000 * np.array(camera.sensor.per_px)).tolist() if camera.sensor.pitch_x_um is not None else (None, None)
-        out[camera.name] = CameraResiduals(int(rows.sum()), float(rms[0]), float(rms[1]), um[0], um[1], float(dof[0]), float(dof[1]))
+        found = CameraResiduals(int(rows.sum()), float(rms[0]), float(rms[1]), um[0], um[1], float(dof[0]), float(dof[1]))
+        if rows.any():
+            variance = network.covariance_px2[rows][:, [0, 2]]
+            typical = np.sqrt(np.mean(adjustment.residual_px[rows] ** 2 / variance, axis=0) * np.median(variance, axis=0)).tolist()
+            found = replace(found, typical_x_px=typical[0], typical_y_px=typical[1])
+        out[camera.name] = found
     return out
 
 

@@ -88,7 +88,7 @@ class Components:
 
 def _record(variance: np.ndarray, given: np.ndarray, found: Components, group: tuple[int, int]) -> AxisComponent:
     factor, added, u = float(found.sizes.factor[group]), float(found.sizes.added_px2[group]), float(found.u_factor[group])
-    sigma = float(np.sqrt(variance.mean())) if len(variance) else float("nan")
+    sigma = float(np.sqrt(np.median(variance))) if len(variance) else float("nan")
     u_added = u / float(np.mean(1 / variance)) if len(variance) else float("nan")  # what moves Σ v²/(s + τ²) by u of itself
     beyond = u_beyond = None
     if found.sizes.adds[group]:
@@ -96,7 +96,7 @@ def _record(variance: np.ndarray, given: np.ndarray, found: Components, group: t
     return AxisComponent(
         sigma_px=sigma,
         u_sigma_px=u_added / (2 * sigma) if found.sizes.adds[group] else sigma * u / 2,
-        given_px=float(np.sqrt(given.mean())) if len(given) else float("nan"),
+        given_px=float(np.sqrt(np.median(given))) if len(given) else float("nan"),
         beyond_px=None if beyond is None else float(beyond),
         u_beyond_px=None if u_beyond is None else float(u_beyond),
         factor=factor,

@@ -15,6 +15,7 @@ from pixmetry.calibrate.page.sources import add_sources
 from pixmetry.calibrate.page.text import (
     DIRECTIONS,
     halves_text,
+    middle_is_held,
     of_camera,
     p_text,
     projection_levels,
@@ -140,11 +141,13 @@ def _verdict(section: Section, calibration: Calibration) -> None:
         levels = projection_levels(of_camera(calibration.tests.projection, model.name))
         readings = [
             Reading(axis, f"{length_px(one.rms_px)} px", f"= {um} µm" if (um := _um(one.rms_um)) else "")
-            for axis, one in (found.axes.items() if found.n else ())
+            for axis, one in (found.typical.items() if found.n else ())
         ]
         if levels is not None and any(levels):
             low, high = (length_px(v) for v in levels)
-            readings.append(Reading("projection", f"{low} px", f"to {high} px in the corners"))
+            held = middle_is_held(levels)
+            told = (f"{high} px", "in the corners; principal point held") if held else (f"{low} px", f"to {high} px in the corners")
+            readings.append(Reading("projection", *told))
         parts += [Text(strong(model.name))] if len(cameras) > 1 else []
         parts += [Text(worth(calibration, k)), *([readings] if readings else [])]
     section.add(Answer([*parts, Text(sigma0_text(calibration), "second")]))

@@ -39,6 +39,8 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 COLUMNS = 100  # of the terminal
+HELD = 1e-3  # u in the middle of the frame over that in the corners, below which the principal point is held
+POOR = 1.25  # rms of all image points over that of a typical one, from which on both are said
 GIVEN_DIGITS = 8  # of a value that was given and held
 TITLES = {
     "c": "Principal distance",
@@ -110,6 +112,11 @@ def projection_levels(projection: ProjectionMap | None) -> tuple[float, float] |
     return float(middle), float(np.nanmax(corners))
 
 
+def middle_is_held(levels: tuple[float, float]) -> bool:
+    """Whether nothing that was estimated moves the middle of the frame: its uncertainty is not nought, but not told."""
+    return levels[0] < HELD * levels[1]
+
+
 def length(px: float, um: float | None) -> str:
     """A length in px and, with a known pitch, in µm."""
     text = f"{length_px(px)}{NO_BREAK}px"
@@ -123,16 +130,21 @@ def worth(calibration: Calibration, camera: int) -> str:
     if found.n == 0:
         return "No image coordinate of this camera was used."
     if any(finding.level == "error" for finding in calibration.findings):
-        in_x, in_y = length(found.rms_x_px, found.rms_x_um), length(found.rms_y_px, found.rms_y_um)
+        in_x, in_y = (length(one.rms_px, one.rms_um) for one in found.axes.values())
         return f"Not calibrated: residuals are {in_x} rms in x and {in_y} in y."
-    text = (
-        f"The image coordinates agree with the calibrated camera to {length(found.rms_x_px, found.rms_x_um)} rms in x and "
-        f"{length(found.rms_y_px, found.rms_y_um)} in y"
-    )
+    in_x, in_y = (length(one.rms_px, one.rms_um) for one in found.typical.values())
+    text = f"The image coordinates agree with the calibrated camera to {in_x} rms in x and {in_y} in y"
+    poor = max(one.rms_px / max(found.typical[axis].rms_px, 1e-300) for axis, one in found.axes.items())
+    if poor > POOR:
+        text += f" (of a typical image point; some are known to be poor, and all together leave {poor:.2g} times as much)"
     levels = projection_levels(of_camera(calibration.tests.projection, name))
     if levels is None:
         return text + "."
     places = f"{length_px(levels[0])}{NO_BREAK}px in the middle of the frame and {length_px(levels[1])}{NO_BREAK}px in its corners"
+    if middle_is_held(levels):
+        places = (
+            f"{length_px(levels[1])}{NO_BREAK}px in the corners of the frame, without what is wrong with the principal point, which is held"
+        )
     return f"{text}; the image of a given direction has a standard uncertainty of {places}."
 
 

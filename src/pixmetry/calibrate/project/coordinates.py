@@ -15,7 +15,8 @@ from pixmetry.core.errors import InputError
 
 MM_PER = {"mm": 1.0, "um": 1e-3}
 UNITS = ("px", "mm", "um")
-UNCERTAINTIES = tuple(f"{kind}_{axis}" for kind in ("u", "var", "sigma") for axis in "xy") + ("cov_xy",)  # how such columns begin
+# how columns of uncertainties begin
+UNCERTAINTIES = tuple(f"{kind}_{what}" for kind in ("u", "var", "sigma", "std") for what in ("x", "y", "px", "mm", "um")) + ("cov_xy",)
 GUESS_PX = 0.05  # standard deviation of an image coordinate about which nothing is said; only the ratios of weights count then
 OUTSIDE = 0.01  # of the frame's sides: how far outside of it a target's centre may be
 MOST_OUTSIDE = 0.2  # of a camera's image coordinates: fewer are gross errors, more come from another frame, unit or origin
@@ -260,9 +261,12 @@ def _covariance(table: Table, unit: str, per_px: np.ndarray, sign: float, u_px: 
             out[:, 0] = (table.numbers(f"u_x_{name}", above=0) / scale[:, 0]) ** 2
             out[:, 2] = (table.numbers(f"u_y_{name}", above=0) / scale[:, 1]) ** 2
             return out, True
+        if f"u_{name}" in table:
+            out[:, 0], out[:, 2] = ((table.numbers(f"u_{name}", above=0) / scale[:, axis]) ** 2 for axis in (0, 1))
+            return out, True
     lost = next((name for name in table.columns if name.lower().startswith(UNCERTAINTIES)), None)
     if lost is not None:
-        allowed = f"u_x_{unit} with u_y_{unit}, or var_x_{unit}2 with var_y_{unit}2 and cov_xy_{unit}2"
+        allowed = f"u_{unit}, u_x_{unit} with u_y_{unit}, or var_x_{unit}2 with var_y_{unit}2 and cov_xy_{unit}2"
         remedy = "rename it, or leave it out with `columns:`"
         raise InputError("an uncertainty of an unknown kind", where=table.source, value=lost, allowed=allowed, remedy=remedy)
     out[:, 0] = out[:, 2] = (u_px or GUESS_PX) ** 2
