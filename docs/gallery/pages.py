@@ -49,11 +49,11 @@ EXPERIMENTS = {  # pages with modules of their own: where in the chapter, title,
         "the chapter's 39 rows for its own camera, and its residual after a calibration",
     ),
 }  # fmt: skip
-NOTES = ("camera-data", "grabber-warm-up", "sampling-clock", "unflatness", "camera-warm-up", "charge-transfer")
 ORDER = (
-    "error-table", "camera-data", "grabber-warm-up", "sampling-clock", "threshold", "unflatness", "offset", "camera-warm-up",
-    "charge-transfer", "line-jitter",
+    "error-table", "camera-data", "grabber-warm-up", "sampling-clock", "laser-speckle", "interlace", "gamma", "threshold", "unflatness",
+    "cable", "window-offset", "offset", "camera-warm-up", "charge-transfer", "amplifier-noise", "line-jitter", "fixed-pattern",
 )  # as in the chapter  # fmt: skip
+NOTES = tuple(name for name in ORDER if name not in EXPERIMENTS)
 
 
 @dataclass(frozen=True)
