@@ -268,7 +268,7 @@ def test_frames_that_cannot_be_used(frame: np.ndarray, text: str) -> None:
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        ({"kind": "blob"}, "no such kind"),
+        ({"kind": "blot"}, "no such kind"),
         ({"estimator": "best"}, "no such estimator"),
         ({"kind": "edge", "estimator": "centroid"}, "no such estimator for kind edge"),
         ({"polarity": "grey"}, "polarity"),

@@ -12,7 +12,7 @@ from pixmetry.cli._console import echo, echo_lines
 EXIT_NOTHING_FOUND = 1
 MOST_NAMED = 5
 NOT_FOUND = "check --kind and --polarity; targets must cover less than half of the image"
-KINDS = ("disc", "ellipse", "ring", "spot", "line", "edge", "cross", "chessboard", "coded")
+KINDS = ("disc", "ellipse", "ring", "spot", "blob", "line", "edge", "cross", "chessboard", "coded")
 
 
 @click.command()

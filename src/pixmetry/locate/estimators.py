@@ -26,6 +26,10 @@ ROWS = {
     "row_soft_threshold": "centroid above a threshold of each row (or column), then a straight line through them",
     "row_template": "a profile fitted to each row (or column), then a straight line through them",
 }
+D4SIGMA, BLOB = "d4sigma", "light_centroid"
+D4SIGMA_TEXT = "first and second moments in three times the width (ISO 11146): centroid, two widths, azimuth and ellipticity of a beam"
+BLOB_TEXT = "centroid of the light of a region of any shape"
+BEAM_PX, BEAM_RATIO = 4.0, 0.8  # half the width of spots at half height from which, ratio of their axes below which they are beams
 SPOTS = ("disc", "ellipse", "ring", "spot")
 FEW_ELECTRONS = 50.0  # at a target's peak: below, the errors of a grey value are visibly no normal ones
 TILTED, TILTED_PX = 0.91, 0.3  # ratio of the axes below which, difference of half axes above which discs are fitted as ellipses
@@ -59,13 +63,19 @@ def estimators(kind: str) -> dict[str, str]:
     >>> list(estimators("line"))[:2]
     ['auto', 'template']
     """
+    if kind == "blob":
+        return {AUTO: AUTO_TEXT, BLOB: BLOB_TEXT}
+    if kind == "spot":
+        return {AUTO: AUTO_TEXT} | {name: method.text for name, method in methods().items()} | {D4SIGMA: D4SIGMA_TEXT}
     if kind in SPOTS or kind == "coded":
         return {AUTO: AUTO_TEXT} | {name: method.text for name, method in methods().items()}
     if kind == "line":
         return {AUTO: AUTO_TEXT, **ROWS}
     if kind in ("edge", "cross", "chessboard"):
         return {AUTO: AUTO_TEXT, "template": "least squares with the target's own shape, integrated over the pixel"}
-    raise InputError("no such kind of target", value=kind, allowed=", ".join((*SPOTS, "line", "edge", "cross", "chessboard", "coded")))
+    raise InputError(
+        "no such kind of target", value=kind, allowed=", ".join((*SPOTS, "blob", "line", "edge", "cross", "chessboard", "coded"))
+    )
 
 
 def seen_shape(kind: str, targets: Targets) -> tuple[str, str]:
@@ -78,6 +88,15 @@ def seen_shape(kind: str, targets: Targets) -> tuple[str, str]:
     if flat < TILTED or float(np.median(major - minor)) > TILTED_PX:
         return "ellipse", f"the discs appear as ellipses, axes 1 : {flat:.2f}"
     return kind, "at the Cramér–Rao bound for every size and noise"
+
+
+def are_beams(targets: Targets) -> bool:
+    """Whether spots are beams of light, whose widths and azimuth are asked for, and no blurred points: large, or longer than wide."""
+    if not len(targets):
+        return False
+    strong = np.abs(targets.amplitude_dn) >= 0.2 * np.abs(targets.amplitude_dn).max()
+    major, minor = float(np.median(targets.semi_major_px[strong])), float(np.median(targets.semi_minor_px[strong]))
+    return minor > BEAM_PX or (minor < BEAM_RATIO * major and minor > LARGE_PX)
 
 
 def chosen_estimator(targets: Targets, noise: NoiseModel, why: str) -> tuple[str, str]:

@@ -14,11 +14,17 @@ from pixmetry.locate.detect.detection import THRESHOLD_SIGMA
 from pixmetry.locate.detect.limits import Limits
 from pixmetry.locate.estimators import estimators, methods
 from pixmetry.locate.frame import checked_frame, scale_ends
-from pixmetry.locate.kinds import Measured, Task, grid_size, locate_chessboard, locate_lines, locate_spots
+from pixmetry.locate.kinds import Measured, Task, grid_size, locate_blobs, locate_chessboard, locate_lines, locate_spots
 from pixmetry.locate.noise import NoiseModel, noise_model
 from pixmetry.locate.records import Located
 
-WORK = {"line": locate_lines, "edge": locate_lines, "cross": locate_lines, "chessboard": locate_chessboard}  # of other kinds: spots
+WORK = {
+    "line": locate_lines,
+    "edge": locate_lines,
+    "cross": locate_lines,
+    "chessboard": locate_chessboard,
+    "blob": locate_blobs,
+}  # of other kinds: spots
 PLANES: dict[str | bool, str | bool] = {"auto": "auto", "never": False, "always": True, False: False, True: True}
 
 
@@ -49,7 +55,7 @@ def locate(
     ----------
     frame : ndarray, shape (rows, cols)
         Grey values: integers of up to 16 bits, or floats.
-    kind : {"disc", "ellipse", "ring", "spot", "line", "edge", "cross", "chessboard", "coded"}
+    kind : {"disc", "ellipse", "ring", "spot", "blob", "line", "edge", "cross", "chessboard", "coded"}
     estimator : str
         ``"auto"`` or one of `estimators(kind)`.
     polarity : {"auto", "bright", "dark"}

@@ -12,7 +12,7 @@ from pixmetry.core.errors import InputError
 from pixmetry.locate.detect.limits import Limits, detect_within
 from pixmetry.locate.detect.targets import Flag, LeftOut, Positions, Targets
 from pixmetry.locate.estimator import Settings
-from pixmetry.locate.estimators import SPOTS, chosen_estimator, methods, seen_shape
+from pixmetry.locate.estimators import BLOB_TEXT, D4SIGMA, SPOTS, are_beams, chosen_estimator, methods, seen_shape
 from pixmetry.locate.lines.line_candidates import LineCandidates
 from pixmetry.locate.noise import ROUNDING_DN2, NoiseModel
 from pixmetry.locate.noise_correlation import with_correlation
@@ -20,6 +20,8 @@ from pixmetry.locate.records import LAST
 
 WITH_ARTICLE = {"disc": "a disc", "ellipse": "an ellipse", "ring": "a ring", "spot": "a spot"}
 UNSETTLED = "the fit did not converge"
+NO_BEAM = "no beam of its own: a lobe of another one, one that fills the frame, or its moments did not come to rest"
+FAINTEST_BEAM = 0.1  # height of a beam over that of the frame's strongest
 FAINTEST = 0.05  # height of lines and edges over that of the frame's strongest
 
 
@@ -62,27 +64,42 @@ class Spots(NamedTuple):
     left_out: LeftOut
 
 
-def find_spots(task: Task) -> Spots:
-    """Detect the targets of a frame that have the shape of the kind, and take the noise that is given, or that the frame shows."""
-    from pixmetry.locate.detect.detection import detect, seen_at, select
+class Seen(NamedTuple):
+    """Regions of any shape as they were detected in a frame."""
 
-    wanted = task.limits
+    regions: Any  # Regions
+    left_out: LeftOut
+    polarity: str
+
+
+def find_regions(task: Task) -> Seen:
+    """Detect what a frame shows."""
+    from pixmetry.locate.detect.detection import detect
+
     look = partial(
         detect,
         polarity=task.polarity,
         high_dn=task.high_dn,
         low_dn=task.low_dn,
-        threshold_sigma=wanted.threshold_sigma,
+        threshold_sigma=task.limits.threshold_sigma,
         threads=task.threads,
     )
-    seen_ones, left_out, polarities = detect_within(task.frame, wanted, look)
+    regions, left_out, polarities = detect_within(task.frame, task.limits, look)
+    return Seen(regions, left_out, polarities.pop() if len(polarities) == 1 else "both")
+
+
+def find_spots(task: Task, found: Seen | None = None) -> Spots:
+    """Detect the targets of a frame that have the shape of the kind, and take the noise that is given, or that the frame shows."""
+    from pixmetry.locate.detect.detection import seen_at, select
+
+    wanted = task.limits
+    seen_ones, left_out, polarity = find_regions(task) if found is None else found
     shape = "ellipse" if task.kind == "coded" else task.kind
     fits = select(seen_ones, shape)
     targets = seen_ones[fits]
     left_out = LeftOut.joined([left_out, seen_at(seen_ones[~fits], f"not the shape of {WITH_ARTICLE[shape]}")])
     seen, why = seen_shape(shape, targets)
     noise = _noise_for(task, seen, targets)  # with the targets' own shape, whatever measures them: what it does not explain is noise
-    polarity = polarities.pop() if len(polarities) == 1 else "both"
     return Spots(targets, seen_ones, noise, seen, why, polarity if len(targets) else "none found", left_out)
 
 
@@ -90,7 +107,10 @@ def locate_spots(task: Task) -> Measured:
     """Targets that are regions: discs, ellipses, rings, spots, with or without a code, on a plate or not."""
     from pixmetry.locate.detect.detection import seen_at
 
-    targets, regions, noise, seen, why, polarity, left_out = find_spots(task)
+    found = find_regions(task)
+    if task.kind == "spot" and (task.estimator == D4SIGMA or (task.estimator == "auto" and are_beams(found.regions))):
+        return locate_beams(task, found)
+    targets, regions, noise, seen, why, polarity, left_out = find_spots(task, found)
     shape = "ellipse" if task.kind == "coded" else task.kind
     estimator, reason = task.estimator, "as was asked for"
     if estimator == "auto":
@@ -122,6 +142,48 @@ def locate_spots(task: Task) -> Measured:
         numbers[index] = place
         columns = _beside(columns, place=numbers)
     return Measured(_only(columns, index[good]), notes, left_out)
+
+
+def locate_blobs(task: Task) -> Measured:
+    """Regions of any shape."""
+    from pixmetry.locate.centroids.light_moments import blob_positions
+    from pixmetry.locate.detect.detection import seen_at
+
+    found = find_regions(task)
+    targets, others = task.limits.wanted(found.regions, task.frame.shape)
+    noise = _smooth_noise(task, targets)
+    positions = blob_positions(task.frame, targets, noise, threads=task.threads)
+    settled = settled_ones(positions)
+    left_out = LeftOut.joined([found.left_out, others, seen_at(targets[~settled], UNSETTLED)])
+    notes = _notes("light_centroid", BLOB_TEXT, noise, found.polarity if len(targets) else "none found")
+    return Measured(_only(_columns(positions, "light_centroid", noise), settled), notes, left_out)
+
+
+def locate_beams(task: Task, found: Seen) -> Measured:
+    """Spots as beams, with their widths and azimuth."""
+    from pixmetry.locate.centroids.light_moments import beam_positions
+    from pixmetry.locate.detect.detection import seen_at
+
+    targets, others = task.limits.wanted(found.regions, task.frame.shape)
+    height = np.abs(targets.amplitude_dn)
+    strong = height >= FAINTEST_BEAM * height.max(initial=0.0)
+    left_out = [found.left_out, others, seen_at(targets[~strong], f"lower than 1/{1 / FAINTEST_BEAM:.0f} of the strongest")]
+    targets = targets[strong]
+    noise = _smooth_noise(task, targets)
+    positions = beam_positions(task.frame, targets, noise, aperture_px=task.aperture_px, threads=task.threads)
+    settled = settled_ones(positions)
+    reason = "as was asked for" if task.estimator == D4SIGMA else "the spots are large or elliptic: beams, with widths by ISO 11146"
+    columns = _only(_columns(positions, D4SIGMA, noise), settled)
+    notes = _notes(D4SIGMA, reason, noise, found.polarity if settled.any() else "none found")
+    return Measured(columns, notes, LeftOut.joined([*left_out, seen_at(targets[~settled], NO_BEAM)]))
+
+
+def _smooth_noise(task: Task, targets: Targets) -> NoiseModel:
+    """The given noise model, or that of the image where its targets have no shape that is known."""
+    from pixmetry.locate.centroids.light_moments import beam_noise
+
+    own = beam_noise(task.frame, targets) if task.noise is None else task.noise
+    return replace(own, low_dn=max(task.low_dn, own.low_dn), high_dn=min(task.high_dn, own.high_dn))
 
 
 def locate_lines(task: Task) -> Measured:
