@@ -126,8 +126,8 @@ def locate(
     if planes not in PLANES:
         raise InputError("no such choice of planes", where="planes", value=planes, allowed="auto, never, always")
     limits = Limits(rois, mask, places_px, diameter_px, contrast_dn, threshold_sigma)
-    if limits.given and kind in WORK:
-        allowed = "disc, ellipse, ring, spot, coded"
+    if limits.given and kind in WORK and kind != "blob":
+        allowed = "disc, ellipse, ring, spot, blob, coded"
         raise InputError(f"{limits.given[0]} is not for targets of this kind", where="kind", value=kind, allowed=allowed)
     image = checked_frame(frame, name)
     model = noise_model(noise)

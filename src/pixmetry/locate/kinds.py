@@ -92,7 +92,6 @@ def find_spots(task: Task, found: Seen | None = None) -> Spots:
     """Detect the targets of a frame that have the shape of the kind, and take the noise that is given, or that the frame shows."""
     from pixmetry.locate.detect.detection import seen_at, select
 
-    wanted = task.limits
     seen_ones, left_out, polarity = find_regions(task) if found is None else found
     shape = "ellipse" if task.kind == "coded" else task.kind
     fits = select(seen_ones, shape)
@@ -105,8 +104,6 @@ def find_spots(task: Task, found: Seen | None = None) -> Spots:
 
 def locate_spots(task: Task) -> Measured:
     """Targets that are regions: discs, ellipses, rings, spots, with or without a code, on a plate or not."""
-    from pixmetry.locate.detect.detection import seen_at
-
     found = find_regions(task)
     if task.kind == "spot" and (task.estimator == D4SIGMA or (task.estimator == "auto" and are_beams(found.regions))):
         return locate_beams(task, found)
@@ -134,29 +131,35 @@ def locate_spots(task: Task) -> Measured:
         columns = _beside(columns, grid_col=placed.col, grid_row=placed.row)
         count = f"{int(placed.placed[settled].sum())} of {int(settled.sum())} targets placed"
         notes["grid"] = placed.message or f"{placed.cols} x {placed.rows}, {count}"
-    index, others, place = task.limits.wanted(targets, task.frame.shape)  # all were measured, for each is another's neighbour
+    return _wanted_ones(task, targets, (settled, whole), Measured(columns, notes, left_out), UNSETTLED)
+
+
+def _wanted_ones(task: Task, targets: Targets, usable: tuple[np.ndarray, np.ndarray], found: Measured, unsettled: str) -> Measured:
+    """The rows that are wanted; all targets were measured, for each is another's neighbour. ``usable``: settled, and no part of one."""
+    from pixmetry.locate.detect.detection import seen_at
+
+    settled, whole = usable
+    columns = found.columns
+    index, others, place = task.limits.wanted(targets, task.frame.shape)
     good = (whole & settled)[index]
-    left_out = LeftOut.joined([left_out, others, seen_at(targets[index[(whole & ~settled)[index]]], UNSETTLED)])
+    left_out = LeftOut.joined([found.left_out, others, seen_at(targets[index[(whole & ~settled)[index]]], unsettled)])
     if place is not None:
-        numbers = np.full(len(positions), -1)
+        numbers = np.full(len(settled), -1)
         numbers[index] = place
         columns = _beside(columns, place=numbers)
-    return Measured(_only(columns, index[good]), notes, left_out)
+    return Measured(_only(columns, index[good]), found.notes, left_out)
 
 
 def locate_blobs(task: Task) -> Measured:
     """Regions of any shape."""
     from pixmetry.locate.centroids.light_moments import blob_positions
-    from pixmetry.locate.detect.detection import seen_at
 
-    found = find_regions(task)
-    targets, others = task.limits.wanted(found.regions, task.frame.shape)
+    targets, left_out, polarity = find_regions(task)
     noise = _smooth_noise(task, targets)
     positions = blob_positions(task.frame, targets, noise, threads=task.threads)
-    settled = settled_ones(positions)
-    left_out = LeftOut.joined([found.left_out, others, seen_at(targets[~settled], UNSETTLED)])
-    notes = _notes("light_centroid", BLOB_TEXT, noise, found.polarity if len(targets) else "none found")
-    return Measured(_only(_columns(positions, "light_centroid", noise), settled), notes, left_out)
+    notes = _notes("light_centroid", BLOB_TEXT, noise, polarity if len(targets) else "none found")
+    found = Measured(_columns(positions, "light_centroid", noise), notes, left_out)
+    return _wanted_ones(task, targets, (settled_ones(positions), np.ones(len(targets), bool)), found, UNSETTLED)
 
 
 def locate_beams(task: Task, found: Seen) -> Measured:
@@ -164,18 +167,17 @@ def locate_beams(task: Task, found: Seen) -> Measured:
     from pixmetry.locate.centroids.light_moments import beam_positions
     from pixmetry.locate.detect.detection import seen_at
 
-    targets, others = task.limits.wanted(found.regions, task.frame.shape)
-    height = np.abs(targets.amplitude_dn)
+    height = np.abs(found.regions.amplitude_dn)
     strong = height >= FAINTEST_BEAM * height.max(initial=0.0)
-    left_out = [found.left_out, others, seen_at(targets[~strong], f"lower than 1/{1 / FAINTEST_BEAM:.0f} of the strongest")]
-    targets = targets[strong]
+    faint = seen_at(found.regions[~strong], f"lower than 1/{1 / FAINTEST_BEAM:.0f} of the strongest")
+    targets = found.regions[strong]
     noise = _smooth_noise(task, targets)
     positions = beam_positions(task.frame, targets, noise, aperture_px=task.aperture_px, threads=task.threads)
     settled = settled_ones(positions)
     reason = "as was asked for" if task.estimator == D4SIGMA else "the spots are large or elliptic: beams, with widths by ISO 11146"
-    columns = _only(_columns(positions, D4SIGMA, noise), settled)
     notes = _notes(D4SIGMA, reason, noise, found.polarity if settled.any() else "none found")
-    return Measured(columns, notes, LeftOut.joined([*left_out, seen_at(targets[~settled], NO_BEAM)]))
+    measured = Measured(_columns(positions, D4SIGMA, noise), notes, LeftOut.joined([found.left_out, faint]))
+    return _wanted_ones(task, targets, (settled, np.ones(len(targets), bool)), measured, NO_BEAM)
 
 
 def _smooth_noise(task: Task, targets: Targets) -> NoiseModel:
