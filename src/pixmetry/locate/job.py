@@ -14,8 +14,9 @@ from pixmetry.locate.detect.detection import THRESHOLD_SIGMA
 from pixmetry.locate.detect.limits import Limits
 from pixmetry.locate.estimators import estimators, methods
 from pixmetry.locate.frame import checked_frame, scale_ends
-from pixmetry.locate.kinds import Measured, Task, grid_size, locate_blobs, locate_chessboard, locate_lines, locate_spots
+from pixmetry.locate.kinds import Measured, Task, beside, grid_size, locate_blobs, locate_chessboard, locate_lines, locate_spots
 from pixmetry.locate.noise import NoiseModel, noise_model
+from pixmetry.locate.quality import quality_of
 from pixmetry.locate.records import Located
 
 WORK = {
@@ -135,7 +136,8 @@ def locate(
     size = grid_size(grid, kind)
     task = Task(image, kind, estimator, polarity, size, model, low, high, aperture_px, light_on, threads, PLANES[planes], limits)
     measured = Measured(*WORK.get(kind, locate_spots)(task))
+    columns = beside(measured.columns, quality=quality_of(measured.columns))
     about = {"name": name, "rows": image.shape[0], "cols": image.shape[1], "targets": len(measured.columns["x_px"]), **measured.notes}
     if len(measured.left_out):
         about["left_out"] = measured.left_out.sentence()
-    return Located(measured.columns, kind, (about,), replace(measured.left_out, image=np.full(len(measured.left_out), name)))
+    return Located(columns, kind, (about,), replace(measured.left_out, image=np.full(len(measured.left_out), name)))

@@ -15,7 +15,7 @@ from pixmetry.locate.estimator import Settings
 from pixmetry.locate.estimators import BLOB_TEXT, D4SIGMA, SPOTS, are_beams, chosen_estimator, methods, seen_shape
 from pixmetry.locate.lines.line_candidates import LineCandidates
 from pixmetry.locate.noise import ROUNDING_DN2, NoiseModel
-from pixmetry.locate.noise_correlation import with_correlation
+from pixmetry.locate.noise_correlation import with_correlation, with_own_residuals
 from pixmetry.locate.records import LAST
 
 WITH_ARTICLE = {"disc": "a disc", "ellipse": "an ellipse", "ring": "a ring", "spot": "a spot"}
@@ -117,6 +117,7 @@ def locate_spots(task: Task) -> Measured:
     settings = Settings(shape, planes, task.light_on, task.aperture_px, task.threads)
     positions = methods()[estimator].positions(task.frame, targets, noise, settings)
     positions, wider = with_correlation(task.frame, regions, targets, positions, noise, shape, task.aperture_px)
+    positions = with_own_residuals(task.frame, targets, positions, noise, shape, task.aperture_px)
     columns = _columns(positions, estimator if shape == task.kind else f"{estimator} ({shape})", noise)
     notes = _notes(estimator, reason, noise, polarity)
     if wider != 1.0:
@@ -128,7 +129,7 @@ def locate_spots(task: Task) -> Measured:
         from pixmetry.locate.detect.grids import order_grid
 
         placed = order_grid(positions.x_px, positions.y_px, pattern=None if task.grid == "any" else task.grid)
-        columns = _beside(columns, grid_col=placed.col, grid_row=placed.row)
+        columns = beside(columns, grid_col=placed.col, grid_row=placed.row)
         count = f"{int(placed.placed[settled].sum())} of {int(settled.sum())} targets placed"
         notes["grid"] = placed.message or f"{placed.cols} x {placed.rows}, {count}"
     return _wanted_ones(task, targets, (settled, whole), Measured(columns, notes, left_out), UNSETTLED)
@@ -139,14 +140,14 @@ def _wanted_ones(task: Task, targets: Targets, usable: tuple[np.ndarray, np.ndar
     from pixmetry.locate.detect.detection import seen_at
 
     settled, whole = usable
-    columns = found.columns
+    columns = _with_grid_scatter(found.columns, found.notes)
     index, others, place = task.limits.wanted(targets, task.frame.shape)
     good = (whole & settled)[index]
     left_out = LeftOut.joined([found.left_out, others, seen_at(targets[index[(whole & ~settled)[index]]], unsettled)])
     if place is not None:
         numbers = np.full(len(settled), -1)
         numbers[index] = place
-        columns = _beside(columns, place=numbers)
+        columns = beside(columns, place=numbers)
     return Measured(_only(columns, index[good]), found.notes, left_out)
 
 
@@ -269,10 +270,30 @@ def locate_chessboard(task: Task) -> Measured:
         positions = place()
     columns = _columns(positions, "template", noise)
     reason = found.message or "two crossing edges, integrated over the pixel; at the Cramér–Rao bound"
-    columns = _beside(columns, grid_col=found.col, grid_row=found.row)
+    columns = beside(columns, grid_col=found.col, grid_row=found.row)
     settled = settled_ones(positions)
     left_out = LeftOut.of(found.x_px[~settled], found.y_px[~settled], UNSETTLED)
-    return Measured(_only(columns, settled), _notes("template", reason, noise, "none found" if found.message else "both"), left_out)
+    notes = _notes("template", reason, noise, "none found" if found.message else "both")
+    return Measured(_with_grid_scatter(_only(columns, settled), notes), notes, left_out)
+
+
+def _with_grid_scatter(columns: dict[str, np.ndarray], notes: dict[str, Any]) -> dict[str, np.ndarray]:
+    """The columns with variances that hold how far the targets of a grid scatter, where this is more than was stated."""
+    from pixmetry.locate.grid_scatter import grid_scatter
+
+    if "grid_col" not in columns:
+        return columns
+    mean = 0.5 * (columns["var_x_px2"] + columns["var_y_px2"])
+    found = grid_scatter(columns["x_px"], columns["y_px"], mean, columns["grid_col"], columns["grid_row"])
+    if found is None:
+        return columns
+    notes["grid_scatter"] = f"{found.scatter_px:.2g} px against neighbours, {found.stated_px:.2g} px stated"
+    if not found.added_px:
+        return columns
+    notes["grid_scatter"] += f"; {found.added_px:.2g} px added to the uncertainties"
+    wider = {name: columns[name] + found.added_px**2 for name in ("var_x_px2", "var_y_px2")}
+    flags = {"flags": columns["flags"] | np.uint32(Flag.GRID_SCATTER)}
+    return beside(columns | wider | flags, grid_scatter_px=np.full(len(mean), found.added_px))
 
 
 def _noise_for(task: Task, kind: str, targets: Targets | np.ndarray) -> NoiseModel:
@@ -329,7 +350,7 @@ def _coded(task: Task, positions: Positions, columns: dict[str, np.ndarray]) -> 
     major, minor, angle = more["semi_major_px"], more["semi_minor_px"], more["angle_deg"]
     codes = read_codes(task.frame, x, y, major, minor, angle, more["amplitude_dn"], threads=task.threads)
     whole = ~ring_members(x, y, major, minor, angle, codes.number)
-    return _beside(columns, code=codes.number, code_margin=codes.margin), whole
+    return beside(columns, code=codes.number, code_margin=codes.margin), whole
 
 
 def settled_ones(positions: Positions) -> np.ndarray:
@@ -345,7 +366,7 @@ def _only(columns: dict[str, np.ndarray], which: np.ndarray) -> dict[str, np.nda
     return rows | {"target": np.arange(len(rows["x_px"]))}
 
 
-def _beside(columns: dict[str, np.ndarray], **more: np.ndarray) -> dict[str, np.ndarray]:
+def beside(columns: dict[str, np.ndarray], **more: np.ndarray) -> dict[str, np.ndarray]:
     """The columns with some more before the last three."""
     first = {name: values for name, values in columns.items() if name not in LAST}
     return {**first, **more, **{name: columns[name] for name in LAST}}

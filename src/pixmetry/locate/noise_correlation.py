@@ -27,6 +27,7 @@ CLASSES = 5  # sizes of targets whose gains are computed
 ALIKE = 1.1  # ratio of sizes that are one
 UNLIKE = 1.5  # ratio of the variances of targets and ground from which their noise may be of another kind
 SAMPLE = 24  # targets whose residuals are looked at then
+MOST_POOR = 100  # poor fits whose own residuals are looked at
 LEAST_SHARE = 0.01  # of the noise's variance: ground without noise tells nothing
 LEAST_FACTOR = 0.05  # of a variance: opposite neighbours do not take more
 
@@ -314,6 +315,34 @@ def with_correlation(
         more={**positions.more, **more},
     )
     return changed, float(np.median(np.sqrt(0.5 * (fx + fy))[good]))
+
+
+def with_own_residuals(
+    frame: np.ndarray, targets: Targets, positions: Positions, noise: NoiseModel, kind: str, aperture_px: float
+) -> Positions:
+    """Positions whose poor fits have a covariance that holds how alike neighbouring residuals are: dirt and glints are no noise of pixels.
+
+    Only the worst, up to `MOST_POOR` with more than twice the usual χ², are looked at.
+    """
+    chi2 = positions.more.get("chi2_per_dof", np.zeros(0))
+    poor = np.flatnonzero((positions.flags & (Flag.POOR_FIT | Flag.NOT_CONVERGED) == Flag.POOR_FIT) & np.isfinite(positions.var_x_px2))
+    if not len(chi2) or not len(poor):
+        return positions
+    poor = poor[chi2[poor] > 2 * max(1.0, float(np.nanmedian(chi2)))]
+    poor = poor[np.argsort(-chi2[poor])][:MOST_POOR]
+    wide = np.zeros((2 * LAGS_PX + 1,) * 2)
+    wide[LAGS_PX, LAGS_PX] = 1.0
+    alone, factor = Correlation(wide, np.ones_like(wide)), np.ones((2, len(positions)))
+    given = replace(noise, origin="given")
+    for i in poor:
+        one = _drawn(frame, targets, positions, int(i), kind, aperture_px)
+        factor[:, i] = np.maximum(spread_of(one, given, alone, residual_correlation([one], given)).factor[:2], 1.0)
+    return replace(
+        positions,
+        var_x_px2=positions.var_x_px2 * factor[0],
+        cov_xy_px2=positions.cov_xy_px2 * np.sqrt(factor[0] * factor[1]),
+        var_y_px2=positions.var_y_px2 * factor[1],
+    )
 
 
 def _drawn(frame: np.ndarray, targets: Targets, positions: Positions, i: int, kind: str, aperture_px: float) -> Drawn:

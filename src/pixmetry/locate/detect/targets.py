@@ -23,6 +23,7 @@ class Flag(IntFlag):
     NOT_CONVERGED = 256  # the fit did not come to rest, or far from knows the place; such targets are left out of tables
     FAINT = 512  # so little contrast that the covariance, which is of first order, is too small
     DEFECT = 1024  # pixels that stand out alone (hot, dead, hit by a particle) were left out
+    GRID_SCATTER = 2048  # the targets of the grid scatter more than was stated: the covariance holds this scatter
 
     def words(self) -> str:
         """Names joined by ``|``, lower case; empty if there are none."""
