@@ -16,10 +16,12 @@ from scipy.spatial import cKDTree
 from scipy.special import j1
 
 from locate import rendered
+from pixmetry.locate.detect.targets import Flag
 from pixmetry.locate.job import locate
 
 Exposure = Callable[[np.ndarray, np.random.Generator], np.ndarray]
 SIGMA = 1.5  # noise of a pixel, DN
+WARNING = int(Flag.POOR_FIT | Flag.FAINT | Flag.NOT_CONVERGED | Flag.UNDER_SAMPLED | Flag.CLIPPED_AT_BLACK)  # u may be too small
 
 
 @dataclass(frozen=True)
@@ -90,7 +92,7 @@ def hot(mean: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 def rows(mean: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Each row has an offset of its own."""
-    return white(mean, rng) + rng.normal(0, 0.7, (mean.shape[0], 1))
+    return white(mean, rng) + rng.normal(0, 1.0, (mean.shape[0], 1))
 
 
 def stripes(mean: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -123,6 +125,11 @@ def clipped_float(mean: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return np.minimum(white(mean, rng), 170.0)
 
 
+def black_float(mean: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """A float picture without an offset: values below 0 were cut off."""
+    return np.maximum(white(mean - 39.0, rng), 0.0)
+
+
 def jpeg(mean: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Stored as a JPEG of quality 85."""
     import imagecodecs
@@ -141,8 +148,10 @@ def pictures(side: int, seed: int = 0) -> dict[str, Picture]:
     plain = discs(rng, side)
     cases = {f.__name__: Picture(*plain, f) for f in (white, hot, rows, stripes, texture, smeared, sharpened, jpeg)}
     cases["clipped_float"] = Picture(*plain, clipped_float, bits=None)
+    cases["black_float"] = Picture(*plain, black_float, bits=None)
     cases["sloped"] = Picture(*discs(rng, side, light=0.012), white)
     cases["sloped, smeared"] = Picture(*discs(rng, side, light=0.012), smeared)
+    cases["airy 0.9"] = Picture(*airy(rng, side, 0.9), white, {"kind": "spot"})
     cases["airy 1.2"] = Picture(*airy(rng, side, 1.2), white, {"kind": "spot"})
     cases["airy 2.5"] = Picture(*airy(rng, side, 2.5), white, {"kind": "spot"})
     for aspect in (0.8, 0.5):
@@ -152,6 +161,26 @@ def pictures(side: int, seed: int = 0) -> dict[str, Picture]:
     large = discs(rng, max(side // 2, 2), radius=14.0, blur=1.5)
     cases["gaussian, large and noisy"] = Picture(*large, loud, {"estimator": "gaussian"})
     return cases
+
+
+def spoiled(rng: np.random.Generator, side: int) -> Picture:
+    """Discs of which 6 % have dirt over their edge, 4 % a glint at it, and 4 % lie partly in a shade."""
+    mean, x, y = discs(rng, side)
+    v, u = np.indices(mean.shape)
+    mean = mean.copy()
+    for k in range(len(x)):
+        what, turn = rng.random(), rng.uniform(0, 2 * np.pi)
+        along = (u - x[k]) * np.cos(turn) + (v - y[k]) * np.sin(turn)
+        beside = (v - y[k]) * np.cos(turn) - (u - x[k]) * np.sin(turn)
+        if what < 0.06:
+            mean -= rng.uniform(20, 140) * np.exp(-((along - 3.5) ** 2 + beside**2) / (2 * rng.uniform(1, 2.5) ** 2))
+        elif what < 0.10:
+            mean += rng.uniform(20, 60) * np.exp(-((along - 4) ** 2 + beside**2) / (2 * 0.8**2))
+        elif what < 0.14:
+            shade = rng.uniform(0.3, 1) / (1 + np.exp(np.clip(-2 * (along - rng.uniform(1, 3)), -50, 50)))
+            near = np.maximum(np.abs(u - x[k]), np.abs(v - y[k])) < 9
+            mean = np.where(near, mean - (mean - 40) * shade, mean)
+    return Picture(np.maximum(mean, 0.0), x, y, white)
 
 
 @dataclass(frozen=True)
@@ -166,7 +195,7 @@ class Score:
     wanted: int
 
 
-def score(picture: Picture, rng: np.random.Generator, draws: int, warning: int, **options: Any) -> Score:
+def score(picture: Picture, rng: np.random.Generator, draws: int, warning: int = WARNING, **options: Any) -> Score:
     """Locate some exposures and match them with the truth; ``warning``: the flags that say that u may be too small."""
     tree, parts = cKDTree(np.stack([picture.x, picture.y], axis=1)), []
     for _ in range(draws):
