@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from pixmetry.calibrate.lines.plumb_line import LineCalibration
     from pixmetry.calibrate.project import Project
 
-__all__ = ["StoredCalibration", "calibrate", "read_calibration"]
+__all__ = ["StoredCalibration", "calibrate", "read_calibration", "solve_again"]
 
 PROJECT_ENDINGS = (".yaml", ".yml")
 # What is said with pictures, and the keys of a project's ``cameras`` and ``pictures`` that mean the same.
@@ -154,6 +154,53 @@ def calibrate(
         write_results(calibration, output, cameras, of, project.inputs if project is not None else ())
     step("")
     return calibration
+
+
+def solve_again(
+    calibration: Calibration,
+    *,
+    free: Sequence[str] | str | None = None,
+    per_image: Sequence[str] | str | None = None,
+    options: Mapping[str, Any] | None = None,
+    without: Sequence[str] = (),
+    progress: Progress | None = None,
+) -> Calibration:
+    """Calibrate the same image coordinates once more, with a change.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        As `calibrate` returned it: it holds what it was made from. One that was read from a folder does not.
+    free, per_image, options
+        As of `calibrate`, in place of those of the first time.
+    without : sequence of str
+        Images to leave out.
+    progress : callable, optional
+
+    Raises
+    ------
+    InputError, MeasureError
+        As `calibrate` does, and if an image is unknown or nothing is held.
+    """
+    from pixmetry.calibrate.bundle.solve import calibrate_network
+    from pixmetry.calibrate.checks.hold_out import subset
+
+    if calibration.given is None:
+        raise InputError("the calibration does not hold what it was made from", remedy="calibrate the project again")
+    network, state = _changed(calibration.given, free, per_image), calibration.adjustment.state
+    unknown = next((name for name in without if name not in network.images), None)
+    if unknown is not None:
+        raise InputError(f"no image '{unknown}'", where="without", allowed=", ".join(network.images[:5]) + " …", remedy="correct the name")
+    if without:
+        network, state, _ = subset(network, state, ~np.isin(network.images, list(without)))
+    before = {key: value for key, value in calibration.provenance.get("options", {}).items() if key not in (options or {})}
+    chosen = _options({**before, **(options or {})})
+    held = np.stack([np.where(camera.free, row, camera.values) for camera, row in zip(network.cameras, state.interior, strict=True)])
+    step = _steps(progress or no_progress)
+    found = calibrate_network(network, chosen, start=replace(state, interior=held), progress=step)
+    step("")
+    about = {**calibration.provenance, "options": {field.name: getattr(chosen, field.name) for field in fields(chosen)}}
+    return replace(found, provenance=about)
 
 
 def _from_lines(

@@ -14,7 +14,7 @@ from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 import numpy as np
 
-from pixmetry.calibrate.bundle.network import Adjustment
+from pixmetry.calibrate.bundle.network import Adjustment, Network
 from pixmetry.calibrate.tables import TABLES
 from pixmetry.core.data_frame import data_frame
 from pixmetry.core.errors import InputError
@@ -1528,6 +1528,8 @@ class Calibration:
         Of `ResidualGrid`, by camera name.
     provenance : mapping
         Inputs with their hashes, options, version.
+    given : Network, optional
+        What was calibrated, before weights and corrections: `pixmetry.calibrate.job.solve_again` starts from it.
     """
 
     adjustment: Adjustment
@@ -1535,6 +1537,7 @@ class Calibration:
     tests: Tests = field(default_factory=Tests)
     grids: Mapping[str, ResidualGrid] = field(default_factory=dict)
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    given: Network | None = None
 
     def __repr__(self) -> str:
         a = self.adjustment

@@ -74,7 +74,7 @@ def calibrate_network(
         tests = replace(tests, residual_grid=residual_grids(settled.adjustment))
     findings += [*more, *_findings(settled, tests)]
     findings += _no_scale(network, settled.adjustment) + pose_findings(network, settled.adjustment.state)
-    return Calibration(stated, in_order(findings), tests, tests.residual_grid or {}, {"options": asdict(options)})
+    return Calibration(stated, in_order(findings), tests, tests.residual_grid or {}, {"options": asdict(options)}, network)
 
 
 def _no_scale(network: Network, adjustment: Adjustment) -> list[Finding]:
