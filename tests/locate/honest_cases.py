@@ -183,6 +183,20 @@ def spoiled(rng: np.random.Generator, side: int) -> Picture:
     return Picture(np.maximum(mean, 0.0), x, y, white)
 
 
+def plate(rng: np.random.Generator, side: int, off_px: float) -> np.ndarray:
+    """A plate of side × side dots at a pitch of 24 px, seen at an angle, each printed off by so much; one exposure in 8 bits."""
+    col, row = (c.ravel() for c in np.meshgrid(np.arange(side) - side / 2, np.arange(side) - side / 2))
+    depth = 1 + 0.003 * col - 0.002 * row
+    x, y = (12.0 * side + 24 * c / depth + rng.normal(0, off_px, side * side) for c in (col + 0.03 * row, row - 0.02 * col))
+    shape = (24 * side + 24, 24 * side + 24)
+    images = []
+    for px, py in zip(x, y, strict=True):
+        at = rendered.window(px, py, 9, shape)
+        images.append((at, rendered.disc(px, py, 4.0, 0.7, at)))
+    mean = rendered.planted(shape, 40.0, 150.0, images)
+    return np.clip(np.rint(white(mean, rng)), 0, 255).astype(np.uint8)
+
+
 @dataclass(frozen=True)
 class Score:
     """Errors over stated uncertainties, of coordinates; which of them stand in a row with a flag; the errors, and the targets wanted."""
