@@ -16,6 +16,8 @@ CLIP = 3.0  # standard deviations kept by a clipped moment
 KEPT = 1.0 / 0.97334  # variance of a normal distribution over that of its part within ±CLIP: 1 − 2·3·φ(3)/(2Φ(3) − 1)
 ROUNDS = 4
 HALVINGS = 16
+OUTER = 0.13  # of the quantile of a covered tile's ground: a quantile farther out, on the side without targets
+OUTER_SIGMA = 1.2  # distance of the two where the ground is a third of the tile, 1.4 σ, to where it is the whole, 1.0 σ
 MANY = 0.25  # share of a tile's pixels at an end of the scale from which on its background is taken as clipped there
 SWEEPS = 30  # of relaxation, over what is filled in
 SUM_FREELY = {"reassoc", "nsz"}  # a clipped sum is not sensitive to the order of its terms, and four times as fast in any order
@@ -30,8 +32,9 @@ class Map(NamedTuple):
 
 
 @jit
-def median_of(values: Singles, low: np.float32, high: np.float32, grain: np.float32) -> np.float32:
-    """Median of values between low and high, by halving: to 2⁻¹⁶ of their range, or the grain."""
+def quantile_of(values: Singles, share: float, low: np.float32, high: np.float32, grain: np.float32) -> np.float32:
+    """Quantile of values between low and high, by halving: to 2⁻¹⁶ of their range, or the grain."""
+    count = share * len(values)
     for _ in range(HALVINGS):
         if high - low <= grain:
             break
@@ -39,7 +42,7 @@ def median_of(values: Singles, low: np.float32, high: np.float32, grain: np.floa
         below = np.int32(0)
         for i in range(len(values)):
             below += np.int32(values[i] <= middle)
-        if 2 * below >= len(values):
+        if below >= count:
             high = middle
         else:
             low = middle
@@ -70,11 +73,14 @@ def clipped_moments(values: Singles, centre: np.float32, limit: np.float32) -> t
 
 
 @jit
-def clipped_rms(values: Singles, grain: np.float32) -> float:
-    """Root mean square of values ≥ 0, of which those beyond three times it are left out; it starts from their median."""
+def clipped_rms(values: Singles, share: float, grain: np.float32) -> float:
+    """Root mean square of values ≥ 0, of which those beyond three times it are left out; it starts from their median.
+
+    Or from a lower quantile, which is made as large as the median of a normal distribution would be (to 5 % from 0.1 to 0.5).
+    """
     if len(values) == 0:
         return 0.0
-    middle = median_of(values, np.float32(0.0), least_and_most(values)[1], grain)
+    middle = quantile_of(values, share, np.float32(0.0), least_and_most(values)[1], grain) * np.float32(0.5 / share)
     limit = np.float32(4.0) * middle + np.float32(2.0) * grain
     rms = np.float32(0.0)
     for _ in range(ROUNDS):
@@ -130,11 +136,11 @@ def lone_pixels(frame: np.ndarray, first_row: int, stop_row: int, first_col: int
 
 @jit
 def tile_levels(
-    frame: np.ndarray, edge_row: Ints, edge_col: Ints, first: int, stop: int, low_dn: float, high_dn: float, grain: np.float32
+    frame: np.ndarray, edge_row: Ints, edge_col: Ints, first: int, stop: int, low_dn: float, high_dn: float, grain: np.float32, share: float
 ) -> Array:
-    """Medians of the tiles of some tile rows, and their noise; shape (6, stop − first, columns).
+    """Medians, or other quantiles, of the tiles of some tile rows, and their noise; shape (6, stop − first, columns).
 
-    Median; standard deviation from the clipped differences of horizontal neighbours; the end of the scale, −1 or 1, at which many of the
+    Quantile; standard deviation from the clipped differences of horizontal neighbours; the end of the scale, −1 or 1, at which many of the
     pixels are, or 0; and there what `lone_pixels` says.
     """
     columns = len(edge_col) - 1
@@ -146,8 +152,11 @@ def tile_levels(
             n, m = seen(frame, a, b, c, d, values, steps)
             least, most = least_and_most(values[:n])
             tile = out[:, t - first, u]
-            tile[0] = median_of(values[:n], least, most, grain)
-            tile[1] = clipped_rms(steps[:m], grain) / math.sqrt(2.0)
+            tile[0] = quantile_of(values[:n], share, least, most, grain)
+            tile[1] = clipped_rms(steps[:m], min(share, 1.0 - share), grain) / math.sqrt(2.0)
+            if share != 0.5:
+                tail = OUTER * share if share < 0.5 else 1.0 - OUTER * (1.0 - share)
+                tile[1] = min(tile[1], abs(tile[0] - quantile_of(values[:n], tail, least, most, grain)) / OUTER_SIGMA)
             if least <= low_dn and np.count_nonzero(values[:n] <= low_dn) > MANY * n:
                 tile[2] = -1.0
                 tile[3], tile[4], tile[5] = lone_pixels(frame, a, b, c, d, low_dn)

@@ -274,25 +274,45 @@ def summits(runs: Runs, height: Singles, n: int, least: float, seed: float, leas
 
 
 @jit
-def smooth_heights(frame: np.ndarray, ground: Map, sign: int, box: tuple[int, int, int, int], runs: Runs, out: Singles) -> None:
-    """Heights of a window in the mean of 3 × 3 pixels, and its rows as runs."""
+def smooth_heights(
+    frame: np.ndarray, ground: Map, sign: int, box: tuple[int, int, int, int], half: int, runs: Runs, out: Singles
+) -> None:
+    """Heights of a window in the mean of 2·half + 1 pixels squared, as far as these are in the frame; and its rows as runs."""
     first_row, stop_row, first_col, stop_col = box
-    wide = stop_col - first_col
+    rows, cols = frame.shape
+    wide, begin, end = stop_col - first_col, max(first_col - half, 0), min(stop_col + half, cols)
+    column = np.zeros(end - begin)
+    for r in range(max(first_row - half, 0), min(first_row + half, rows)):
+        for c in range(begin, end):
+            column[c - begin] += frame[r, c]
     for r in range(first_row, stop_row):
         i = r - first_row
         runs[i, 0], runs[i, 1], runs[i, 2], runs[i, 3], runs[i, 4] = r, first_col, stop_col, sign, i * wide
+        if r + half < rows:
+            for c in range(begin, end):
+                column[c - begin] += frame[r + half, c]
+        if r - half - 1 >= max(first_row - half, 0):
+            for c in range(begin, end):
+                column[c - begin] -= frame[r - half - 1, c]
+        high = min(r + half + 1, rows) - max(r - half, 0)
+        total = 0.0
+        for c in range(begin, min(first_col + half, end)):
+            total += column[c - begin]
         for c in range(first_col, stop_col):
-            total, n = 0.0, 0
-            for y in range(max(r - 1, 0), min(r + 2, frame.shape[0])):
-                for x in range(max(c - 1, 0), min(c + 2, frame.shape[1])):
-                    total += float(frame[y, x])
-                    n += 1
+            if c + half < end:
+                total += column[c + half - begin]
+            if c - half - 1 >= begin:
+                total -= column[c - half - 1 - begin]
+            n = high * (min(c + half + 1, cols) - max(c - half, 0))
             out[i * wide + c - first_col] = sign * (total / n - map_at(ground, float(c), float(r))[0])
 
 
 @jit
-def add_faint(frame: np.ndarray, ground: Map, region: Runs, out: Array, found: int) -> tuple[Array, int]:
-    """Measure a region whose half height is in the noise: with smoothed heights, in a window that grows until it contains the region."""
+def add_faint(frame: np.ndarray, ground: Map, region: Runs, half: int, out: Array, found: int) -> tuple[Array, int]:
+    """Measure a region whose half height is in the noise: with smoothed heights, in a window that grows until it contains the region.
+
+    The means are over 2·half + 1 pixels squared.
+    """
     rows, cols = frame.shape
     first_row, stop_row, first_col, stop_col = region[0, 0], region[len(region) - 1, 0] + 1, region[0, 1], region[0, 2]
     for i in range(len(region)):
@@ -304,7 +324,7 @@ def add_faint(frame: np.ndarray, ground: Map, region: Runs, out: Array, found: i
         a, b = max(first_row - grown, 0), min(stop_row + grown, rows)
         c, d = max(first_col - grown, 0), min(stop_col + grown, cols)
         window, height = np.empty((b - a, RUN), np.int32), np.empty((b - a) * (d - c), np.float32)
-        smooth_heights(frame, ground, region[0, 3], (a, b, c, d), window, height)
+        smooth_heights(frame, ground, region[0, 3], (a, b, c, d), half, window, height)
         own = region.copy()
         for i in range(len(own)):
             own[i, 4] = (own[i, 0] - a) * (d - c) + own[i, 1] - c
@@ -369,7 +389,7 @@ def measure_regions(
         born = found
         level = 0.5 * top
         if level < low:
-            out, found = add_faint(frame, ground, region, out, born)
+            out, found = add_faint(frame, ground, region, 1, out, born)
         else:
             parts = table[: cut_runs(region, height, level, table)]
             separate, holes = count_joined(parts, parent, touches)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
@@ -15,10 +15,14 @@ from pixmetry.locate.detect.targets import Flag, LeftOut, Targets
 POLARITIES = ("auto", "bright", "dark")
 KINDS = ("disc", "ellipse", "ring", "spot")
 LARGEST_RATIO = 3.2  # of the axes of a disc seen at 70°, 2.9, and some noise
-STEEPEST = 0.65  # least noise of a tile over its noisiest neighbour's: from 0.63 on the bilinear continuation stays above 0
 CUT_FILL = 0.1  # by which segments of a disc are less full than the disc
 THRESHOLD_SIGMA = 4.0
 LEAST_AREA_PX = 3
+FALSE_ALARMS = 0.01  # a frame
+FARTHEST_PX = 12.0  # from the outline of a target that its skirt counts as its own
+MORE = 1.01  # area of targets that another reading of the background must show
+TWO_LEVELS = 0.8  # least share of the variance between two levels
+MOST_SEEN = 60000  # pixels
 BEYOND_DN = 1e30  # no grey value is so far from the background
 
 
@@ -61,6 +65,10 @@ class Detection:
         Of the targets.
     left_out : LeftOut
         What other targets cause.
+    reading : {"", "dark", "bright"}
+        What the background is where targets cover the frame: its dark or its bright parts. Empty where it is what most pixels are.
+    known : ndarray, shape (n, 5), int32
+        Runs of pixels beyond the threshold that belong to targets: row, first and stop column, sign.
     """
 
     targets: Regions
@@ -68,6 +76,8 @@ class Detection:
     sigma_dn: float
     polarity: str
     left_out: LeftOut = field(default_factory=LeftOut.of)
+    reading: str = ""
+    known: np.ndarray = field(default_factory=lambda: np.empty((0, 5), np.int32))
 
 
 def detect(
@@ -78,6 +88,7 @@ def detect(
     low_dn: float = -math.inf,
     least_area_px: int = LEAST_AREA_PX,
     threshold_sigma: float = THRESHOLD_SIGMA,
+    false_alarms: float = FALSE_ALARMS,
     threads: int | None = None,
 ) -> Detection:
     """Find regions above (or below) the background.
@@ -94,6 +105,8 @@ def detect(
         Connected pixels beyond the threshold that make a region.
     threshold_sigma : float
         Threshold in standard deviations of the background's noise.
+    false_alarms : float
+        Greatest expected number of false targets that the matched filter finds in a frame of noise.
     threads : int, optional
 
     Raises
@@ -116,40 +129,117 @@ def detect(
     What others cause is left out: less than 0.4 of another target's height, on the other side of the background and at its edge (the halo
     of a sharpening filter), or less than 0.08 of it within 12 pixels (stray light, and ringing in a coder's block).
     """
-    from pixmetry.locate.detect._background_kernels import Map
-    from pixmetry.locate.detect._detect_kernels import find_runs, group_runs
-    from pixmetry.locate.detect._region_kernels import GroupedRuns, measure_regions
-
     if polarity not in POLARITIES:
         raise InputError("no such polarity", value=polarity, allowed=", ".join(POLARITIES))
     if not (threshold_sigma > 0 and least_area_px >= 1):
         raise InputError("a threshold or area that no target exceeds", value=(threshold_sigma, least_area_px), allowed="above 0; 1 or more")
-    ground = background(frame, low_dn=low_dn, high_dn=high_dn, threads=threads)
-    *ends, grain = scale_of(frame, low_dn, high_dn)
-    reach = threshold_sigma * _tame(ground.sigma_dn) + 0.5 * grain
-    low = ground.level_dn - (reach if polarity != "bright" else BEYOND_DN)
-    high = ground.level_dn + (reach if polarity != "dark" else BEYOND_DN)
-    bands = bands_of(frame.shape[0], threads)
-    runs, start = group_runs(np.concatenate(map_tiles(lambda b: find_runs(frame, low, high, *ground.scales, *b), bands, threads)))
-    shares = np.searchsorted(start, np.linspace(0, len(runs), len(bands) + 1)).tolist()
-    regions, least, level = GroupedRuns(runs, start), Map(reach, *ground.scales), Map(ground.level_dn, *ground.scales)
-    parts = map_tiles(
-        lambda b: measure_regions(frame, regions, least, level, b, least_area_px, (ends[0], ends[1])),
-        zip(shares[:-1], [*shares[1:-1], len(start) - 1], strict=True),
-        threads,
-    )
-    targets, left_out = _genuine(_targets(np.concatenate(parts), ground))
+    if not 0 < false_alarms < math.inf:
+        raise InputError("no rate of false alarms", where="false_alarms", value=false_alarms, allowed="above 0, such as 0.01")
+    look = _Look(frame, polarity, low_dn, high_dn, least_area_px, threshold_sigma, false_alarms, threads)
+    found = look.detected("")
+    if found.background.doubtful:
+        found = look.better_reading(found)
+    return look.with_faint_ones(found) if not found.reading else found  # else the ground is a few pixels between targets
+
+
+@dataclass(frozen=True)
+class _Look:
+    """A frame, and how targets are looked for in it."""
+
+    frame: np.ndarray
+    polarity: str
+    low_dn: float
+    high_dn: float
+    least_area_px: int
+    threshold_sigma: float
+    false_alarms: float
+    threads: int | None
+
+    def detected(self, reading: str) -> Detection:
+        """Regions beyond the threshold, of one reading of the background."""
+        from pixmetry.locate.detect._background_kernels import Map
+        from pixmetry.locate.detect._detect_kernels import find_runs, group_runs
+        from pixmetry.locate.detect._region_kernels import GroupedRuns, measure_regions
+
+        frame, threads = self.frame, self.threads
+        ground = background(frame, low_dn=self.low_dn, high_dn=self.high_dn, ground=reading, threads=threads)
+        *ends, grain = scale_of(frame, self.low_dn, self.high_dn)
+        reach = self.threshold_sigma * ground.tame_sigma_dn + 0.5 * grain
+        low = ground.level_dn - (reach if self.polarity != "bright" else BEYOND_DN)
+        high = ground.level_dn + (reach if self.polarity != "dark" else BEYOND_DN)
+        bands = bands_of(frame.shape[0], threads)
+        runs, start = group_runs(np.concatenate(map_tiles(lambda b: find_runs(frame, low, high, *ground.scales, *b), bands, threads)))
+        shares = np.searchsorted(start, np.linspace(0, len(runs), len(bands) + 1)).tolist()
+        regions, least, level = GroupedRuns(runs, start), Map(reach, *ground.scales), Map(ground.level_dn, *ground.scales)
+        parts = map_tiles(
+            lambda b: measure_regions(frame, regions, least, level, b, self.least_area_px, (ends[0], ends[1])),
+            zip(shares[:-1], [*shares[1:-1], len(start) - 1], strict=True),
+            threads,
+        )
+        table = np.concatenate(parts)
+        targets, left_out = _genuine(_targets(table, ground))
+        is_target = np.zeros(len(start) - 1, bool)
+        is_target[table[:, 16].astype(np.int64)] = True
+        known = runs[np.repeat(is_target, np.diff(start))]
+        return Detection(targets, ground, float(np.median(ground.sigma_dn)), _polarity(targets), left_out, reading, known)
+
+    def better_reading(self, usual: Detection) -> Detection:
+        """The reading of the background whose targets cover the greatest area, where a frame of two grey levels leaves a choice."""
+        best, most = usual, MORE * max(_target_area(usual.targets), 0.0)
+        for reading in ("dark", "bright"):
+            if self.polarity == reading:  # bright targets do not stand on the bright parts
+                continue
+            other = self.detected(reading)
+            area = _target_area(other.targets)
+            if area > most and _two_levels(self.frame, other):
+                best, most = other, area
+        return best
+
+    def with_faint_ones(self, found: Detection) -> Detection:
+        """Add the targets that only a matched filter sees."""
+        from pixmetry.locate.detect._background_kernels import Map
+        from pixmetry.locate.detect._faint_kernels import measure_peaks
+        from pixmetry.locate.detect.faint import faint_peaks
+
+        ground, t = found.background, found.targets
+        *ends, grain = scale_of(self.frame, self.low_dn, self.high_dn)
+        margin = int(min(3 + 2 * float(np.median(t.blur_px)), FARTHEST_PX)) if len(t) else 0
+        peaks = faint_peaks(self.frame, ground, found.known, self.polarity, self.false_alarms, grain, margin, self.threads)
+        if not len(peaks):
+            return found
+        table = measure_peaks(self.frame, peaks, Map(ground.level_dn, *ground.scales), (ends[0], ends[1]))
+        new = _targets(table, ground)
+        both = Regions(**{f.name: np.concatenate([getattr(t, f.name), getattr(new, f.name)]) for f in fields(t)})
+        return replace(found, targets=both, polarity=_polarity(both))
+
+
+def _polarity(targets: Targets) -> str:
     bright, dark = bool((targets.amplitude_dn > 0).any()), bool((targets.amplitude_dn < 0).any())
-    kind = "both" if bright and dark else "bright" if bright else "dark" if dark else "none"
-    return Detection(targets, ground, float(np.median(ground.sigma_dn)), kind, left_out)
+    return "both" if bright and dark else "bright" if bright else "dark" if dark else "none"
 
 
-def _tame(sigma_dn: np.ndarray) -> np.ndarray:
-    """The map of the noise, without steps so steep that it would fall below 0 where it is continued to the frame's border."""
-    from scipy.ndimage import maximum_filter
+def _target_area(targets: Regions) -> float:
+    """Area of the whole targets that are discs, ellipses or rings, less that of all else, px²."""
+    shaped = select(targets, "ellipse") | (select(targets, "ring") & (targets.holes == 1))  # the ground between targets has many
+    shaped &= targets.flags & np.uint32(Flag.BORDER) == 0
+    return float(np.where(shaped, targets.area_px, -targets.area_px).sum())
 
-    tame: np.ndarray = np.maximum(sigma_dn, STEEPEST * maximum_filter(sigma_dn, 3))
-    return tame
+
+def _two_levels(frame: np.ndarray, found: Detection) -> bool:
+    """Whether the pixels of a frame have two levels, that of the ground and that of the targets, and not one distribution.
+
+    The share of the variance that lies between the pixels above and below half the targets' height is 0.64 for a normal distribution and
+    0.75 for an even one.
+    """
+    step = max(int(math.sqrt(frame.size / MOST_SEEN)), 1)
+    y, x = (a.ravel().astype(float) for a in np.mgrid[: frame.shape[0] : step, : frame.shape[1] : step])
+    height = (frame[::step, ::step].ravel() - found.background.at(x, y)[0]) / float(np.median(found.targets.amplitude_dn))
+    high = height > 0.5
+    share = float(high.mean())
+    if not 0 < share < 1:
+        return False
+    between = share * (1 - share) * (float(height[high].mean()) - float(height[~high].mean())) ** 2
+    return between > TWO_LEVELS * float(height.var())
 
 
 def select(targets: Regions, kind: str) -> np.ndarray:
