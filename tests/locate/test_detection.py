@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,11 +15,18 @@ from scipy.special import ndtr
 from chance import rng_of
 from pixmetry.core.errors import InputError
 from pixmetry.locate.detect._detect_kernels import find_runs, group_runs
-from pixmetry.locate.detect.detection import Detection, Regions, detect, neighbours, select
+from pixmetry.locate.detect.detection import Detection, Regions, neighbours, select
+from pixmetry.locate.detect.detection import detect as detect_by_rate
 from pixmetry.locate.detect.targets import Flag
 
+RATE = 1e-7  # of false alarms a frame, where a test counts targets
 Shape = Callable[[np.ndarray, np.ndarray], np.ndarray]
 FINE = 4
+
+
+def detect(frame: np.ndarray, **options: Any) -> Detection:
+    """Detection at a rate of false alarms at which a count may be exact."""
+    return detect_by_rate(frame, **({"false_alarms": RATE} | options))
 
 
 def discs(

@@ -11,7 +11,7 @@ from pixmetry.cli._console import echo, echo_lines
 
 EXIT_NOTHING_FOUND = 1
 MOST_NAMED = 5
-NOT_FOUND = "check --kind and --polarity; targets must cover less than half of the image"
+NOT_FOUND = "check --kind and --polarity; targets must cover less than three quarters of the image"
 KINDS = ("disc", "ellipse", "ring", "spot", "blob", "line", "edge", "cross", "chessboard", "coded")
 
 
@@ -196,6 +196,9 @@ def locate(
         echo_lines(table.to_csv(), nl=False)
     for image in table.images:
         echo(f"{image['name']}: {image['targets']} found; {image['estimator']}: {image['reason']}", err=output is None)
+        for key in ("caution", "ground"):
+            if key in image:
+                echo(f"{image['name']}: {key}: {image[key]}", err=output is None)
         if "left_out" in image:
             echo(f"{image['name']}: left out: {image['left_out']}", err=output is None)
         if "file" in image:

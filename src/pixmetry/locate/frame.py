@@ -7,6 +7,8 @@ import numpy as np
 from pixmetry.core.errors import InputError
 from pixmetry.locate.noise import NoiseModel
 
+MOSAIC_LEAST, MOSAIC_SIGMA = 0.02, 6.0  # difference of the two diagonals of 2 × 2 pixels: of the level, and of its standard error
+MOSAIC_CELLS = 100_000  # of 2 × 2 pixels that are looked at
 NEAR_END = 0.01  # of a float image's range: values that lie so near to its end
 PILED = 10  # pixels in 4 of one value at the end of an image before it is asked whether they were cut off there
 
@@ -84,3 +86,36 @@ def _cut_off_at(frame: np.ndarray, top: float, near_dn: float) -> bool:
     usual = float(np.median(part[::4, ::4]))
     without_noise = usual > 0 and np.count_nonzero(part[::4, ::4] == usual) > 0.5 * part[::4, ::4].size
     return bool(top > part.min()) and not without_noise
+
+
+def looks_like_mosaic(frame: np.ndarray) -> bool:
+    """Tell whether a frame is the raw frame of a colour camera: by the typical differences within cells of 2 × 2 pixels.
+
+    Green lies on one diagonal of a cell (Bayer, US 3971065, 1976), red and blue on the other. So one diagonal is brighter, or, where green
+    is the mean of the two, rows and columns alternate by the same amount. Rows alone alternate in interlaced frames, columns alone in
+    frames of two taps; targets differ too, but do not fill most of the cells.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from pixmetry.locate.frame import looks_like_mosaic
+    >>> grey = np.random.default_rng(1).normal(100, 2, (60, 80))
+    >>> looks_like_mosaic(grey), looks_like_mosaic(grey * np.tile([[0.6, 1.0], [1.0, 0.7]], (30, 40)))
+    (False, True)
+    """
+    high, wide = (side // 2 for side in frame.shape)
+    if min(high, wide) < 8:
+        return False
+    step = max(int(np.sqrt(high * wide / MOSAIC_CELLS)), 1)
+    a, b, c, d = (frame[i : 2 * high : 2, j : 2 * wide : 2][::step, ::step].astype(np.float32).ravel() for i in (0, 1) for j in (0, 1))
+    least = MOSAIC_LEAST * abs(float(np.median(a + b + c + d))) / 4
+
+    def typical(difference: np.ndarray) -> float:
+        """Median, or 0 where it may be chance; 1.86 = 1.4826 · 1.2533 makes the standard error of a median of the MAD."""
+        middle = float(np.median(difference))
+        error = 1.86 * float(np.median(np.abs(difference - middle))) / np.sqrt(len(difference))
+        return middle if abs(middle) > MOSAIC_SIGMA * error else 0.0
+
+    diagonals, rows, cols = typical((a + d - b - c) / 2), typical((a + b - c - d) / 2), typical((a + c - b - d) / 2)
+    both = min(abs(rows), abs(cols))
+    return abs(diagonals) > least or (both > least and both > 0.8 * max(abs(rows), abs(cols)))

@@ -13,7 +13,7 @@ from pixmetry.core.errors import InputError
 from pixmetry.locate.detect.detection import THRESHOLD_SIGMA
 from pixmetry.locate.detect.limits import Limits
 from pixmetry.locate.estimators import estimators, methods
-from pixmetry.locate.frame import checked_frame, scale_ends
+from pixmetry.locate.frame import checked_frame, looks_like_mosaic, scale_ends
 from pixmetry.locate.kinds import Measured, Task, beside, grid_size, locate_blobs, locate_chessboard, locate_lines, locate_spots
 from pixmetry.locate.noise import NoiseModel, noise_model
 from pixmetry.locate.quality import quality_of
@@ -27,6 +27,11 @@ WORK = {
     "blob": locate_blobs,
 }  # of other kinds: spots
 PLANES: dict[str | bool, str | bool] = {"auto": "auto", "never": False, "always": True, False: False, True: True}
+
+MOSAIC = (
+    "this is the raw frame of a colour camera: neighbouring pixels see different colours, which shifts positions and hides small targets; "
+    "to do: convert it to colour and choose --channel green, or locate in the pixels of one colour, frame[0::2, 0::2] or frame[0::2, 1::2]"
+)
 
 
 def locate(
@@ -138,6 +143,8 @@ def locate(
     measured = Measured(*WORK.get(kind, locate_spots)(task))
     columns = beside(measured.columns, quality=quality_of(measured.columns))
     about = {"name": name, "rows": image.shape[0], "cols": image.shape[1], "targets": len(measured.columns["x_px"]), **measured.notes}
+    if looks_like_mosaic(image):
+        about["caution"] = MOSAIC
     if len(measured.left_out):
         about["left_out"] = measured.left_out.sentence()
     return Located(columns, kind, (about,), replace(measured.left_out, image=np.full(len(measured.left_out), name)))

@@ -62,6 +62,7 @@ class Spots(NamedTuple):
     why: str
     polarity: str
     left_out: LeftOut
+    ground: str  # "dark" or "bright" where targets cover the frame: the parts of it that were taken as their ground
 
 
 class Seen(NamedTuple):
@@ -70,6 +71,7 @@ class Seen(NamedTuple):
     regions: Any  # Regions
     left_out: LeftOut
     polarity: str
+    ground: str  # as of `Spots`
 
 
 def find_regions(task: Task) -> Seen:
@@ -84,22 +86,22 @@ def find_regions(task: Task) -> Seen:
         threshold_sigma=task.limits.threshold_sigma,
         threads=task.threads,
     )
-    regions, left_out, polarities = detect_within(task.frame, task.limits, look)
-    return Seen(regions, left_out, polarities.pop() if len(polarities) == 1 else "both")
+    regions, left_out, polarities, grounds = detect_within(task.frame, task.limits, look)
+    return Seen(regions, left_out, polarities.pop() if len(polarities) == 1 else "both", " and ".join(sorted(grounds)))
 
 
 def find_spots(task: Task, found: Seen | None = None) -> Spots:
     """Detect the targets of a frame that have the shape of the kind, and take the noise that is given, or that the frame shows."""
     from pixmetry.locate.detect.detection import seen_at, select
 
-    seen_ones, left_out, polarity = find_regions(task) if found is None else found
+    seen_ones, left_out, polarity, ground = find_regions(task) if found is None else found
     shape = "ellipse" if task.kind == "coded" else task.kind
     fits = select(seen_ones, shape)
     targets = seen_ones[fits]
     left_out = LeftOut.joined([left_out, seen_at(seen_ones[~fits], f"not the shape of {WITH_ARTICLE[shape]}")])
     seen, why = seen_shape(shape, targets)
     noise = _noise_for(task, seen, targets)  # with the targets' own shape, whatever measures them: what it does not explain is noise
-    return Spots(targets, seen_ones, noise, seen, why, polarity if len(targets) else "none found", left_out)
+    return Spots(targets, seen_ones, noise, seen, why, polarity if len(targets) else "none found", left_out, ground)
 
 
 def locate_spots(task: Task) -> Measured:
@@ -107,7 +109,7 @@ def locate_spots(task: Task) -> Measured:
     found = find_regions(task)
     if task.kind == "spot" and (task.estimator == D4SIGMA or (task.estimator == "auto" and are_beams(found.regions))):
         return locate_beams(task, found)
-    targets, regions, noise, seen, why, polarity, left_out = find_spots(task, found)
+    targets, regions, noise, seen, why, polarity, left_out, ground = find_spots(task, found)
     shape = "ellipse" if task.kind == "coded" else task.kind
     estimator, reason = task.estimator, "as was asked for"
     if estimator == "auto":
@@ -122,6 +124,9 @@ def locate_spots(task: Task) -> Measured:
     notes = _notes(estimator, reason, noise, polarity)
     if wider != 1.0:
         notes["noise_model"] += f"; neighbouring pixels share noise, u × {wider:.2f}"
+    if ground:
+        taken = f"its {ground} parts were taken as the ground"
+        notes["ground"] = f"targets cover much of the frame; {taken}, and faint targets were not looked for"
     settled, whole = settled_ones(positions), np.ones(len(positions), bool)
     if task.kind == "coded":
         columns, whole = _coded(task, positions, columns)

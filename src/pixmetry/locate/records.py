@@ -46,7 +46,8 @@ class Located:
     kind : str
     images : tuple of dict
         Of each image: ``name``, ``rows``, ``cols``, ``targets``, ``polarity``, ``estimator``, ``reason`` (why
-        this estimator), ``noise_model``, and where something was left out ``left_out`` (how many, and why).
+        this estimator), ``noise_model``, and where something was left out ``left_out`` (how many, and why);
+        where targets cover the frame ``ground``; and ``caution``, what is wrong with the image.
     left_out : LeftOut
         What was seen and is no row: fits that did not converge, other shapes, halos of other targets.
 

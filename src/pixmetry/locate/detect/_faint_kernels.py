@@ -12,6 +12,7 @@ from pixmetry.locate.detect._background_kernels import Map, least_and_most, map_
 from pixmetry.locate.detect._detect_kernels import RUN, Runs, at_columns, doubled
 from pixmetry.locate.detect._region_kernels import FIELDS, add_faint, state
 
+LONE = 1.5  # standard deviations by which a pixel may stand out of its neighbours
 BLOCK = 64  # bins of a row that are looked at together
 PEAK = 4  # numbers of a peak: x, y, score, side of the bin
 
@@ -153,21 +154,33 @@ def find_peaks(bins: Singles, least: float, greatest: float, side: int, first: i
 def sharpen_peaks(frame: np.ndarray, level: Map, reach: Map, peaks: Array, sigmas: float, sizes: Array, steps: int) -> None:
     """Put each peak where a Gaussian weight of one of the sizes, at pixels up to ``steps`` away, has the highest score; write that.
 
-    The heights are those of `bin_heights`; white noise has a score of variance 1.
+    The heights are those of `bin_heights`, and none more than LONE above the second highest of its neighbours, which a defect would be.
+    White noise has a score of variance 1.
     """
     rows, cols = frame.shape
     far = int(math.ceil(2.5 * sizes[-1]))
     wide = 2 * (steps + far) + 1
-    height = np.empty((wide, wide))
+    raw, height = np.zeros((wide + 2, wide + 2)), np.empty((wide, wide))
     for k in range(len(peaks)):
         x, y, sign = int(peaks[k, 0] + 0.5), int(peaks[k, 1] + 0.5), 1.0 if peaks[k, 2] > 0.0 else -1.0
         most = sigmas / map_at(reach, float(x), float(y))[0]
-        for i in range(wide):
-            for j in range(wide):
-                r, c = y + i - steps - far, x + j - steps - far
+        for i in range(wide + 2):
+            for j in range(wide + 2):
+                r, c = y + i - steps - far - 1, x + j - steps - far - 1
                 inside = 0 <= r < rows and 0 <= c < cols
                 h = sign * most * (frame[r, c] - map_at(level, float(c), float(r))[0]) if inside else 0.0
-                height[i, j] = min(max(h, -sigmas), sigmas)
+                raw[i, j] = min(max(h, -sigmas), sigmas)
+        for i in range(wide):
+            for j in range(wide):
+                first, second = 0.0, 0.0
+                for m in range(i, i + 3):
+                    for n in range(j, j + 3):
+                        h = raw[m, n] if m != i + 1 or n != j + 1 else 0.0
+                        if h > first:
+                            first, second = h, first
+                        elif h > second:
+                            second = h
+                height[i, j] = min(raw[i + 1, j + 1], second + LONE)
         best = 0.0
         for size in sizes:
             row = np.array([math.exp(-0.5 * (i / size) ** 2) for i in range(-far, far + 1)])
@@ -216,3 +229,21 @@ def measure_peaks(frame: np.ndarray, peaks: Array, ground: Map, ends: tuple[floa
         if found > born:
             out[born, 14], out[born, 15], out[born, 16] = state(frame, out[born], 2, ends[0], ends[1]), seed[0, 3], -1.0 - k
     return out[:found]
+
+
+@jit
+def stand_apart(places: Array, known: int) -> Flags:
+    """Of rows x, y, first and stop row, first and stop column those behind ``known`` whose box holds no earlier middle, nor the reverse."""
+    n = len(places)
+    apart = np.ones(n - known, np.bool_)
+    for i in range(known, n):
+        x, y = places[i, 0], places[i, 1]
+        for j in range(i):
+            if j >= known and not apart[j - known]:
+                continue
+            u, v = places[j, 0], places[j, 1]
+            holds = places[i, 4] <= u < places[i, 5] and places[i, 2] <= v < places[i, 3]
+            if holds or (places[j, 4] <= x < places[j, 5] and places[j, 2] <= y < places[j, 3]):
+                apart[i - known] = False
+                break
+    return apart

@@ -20,7 +20,7 @@ STEP = 0.5**0.25  # from one level to the next below
 SOLID = 20  # pixels from which on two outliers among them are not believed
 GROWTHS = 5  # of the window in which a faint target is looked for
 SEED = 1.5  # height of a top over the threshold, for a region to be more than noise
-HALO, RINGING, REACH = 0.4, 0.08, 12.0  # see `spurious`
+HALO, REACH = 0.4, 12.0  # see `spurious`
 FIELDS = 17  # of a target: see `describe` and `measure_regions`
 TWICE, GLARE = 1, 2  # why a target is none of its own: see `spurious`
 BORDER, SATURATED, CLIPPED, OVERLAPPING = 1, 2, 4, 16  # of `targets.Flag`
@@ -274,9 +274,7 @@ def summits(runs: Runs, height: Singles, n: int, least: float, seed: float, leas
 
 
 @jit
-def smooth_heights(
-    frame: np.ndarray, ground: Map, sign: int, box: tuple[int, int, int, int], half: int, runs: Runs, out: Singles
-) -> None:
+def smooth_heights(frame: np.ndarray, ground: Map, sign: int, box: tuple[int, int, int, int], half: int, runs: Runs, out: Singles) -> None:
     """Heights of a window in the mean of 2·half + 1 pixels squared, as far as these are in the frame; and its rows as runs."""
     first_row, stop_row, first_col, stop_col = box
     rows, cols = frame.shape
@@ -426,11 +424,11 @@ def simple(region: Runs, target: Array) -> bool:
 
 
 @jit
-def spurious(targets: Outlines, start: Ints, index: Ints) -> NDArray[np.int8]:
+def spurious(targets: Outlines, start: Ints, index: Ints, ringing: float) -> NDArray[np.int8]:
     """Targets that are another one's doing: TWICE, the same one found again; GLARE, a sharpened edge's halo or a compressed one's ringing.
 
     ``start`` and ``index`` say which targets are near each other. A halo has the other sign, less than HALO of the height, and lies at the
-    edge; ringing has less than RINGING of the height and lies within REACH pixels, a block of the coder.
+    edge; ringing has less than ``ringing`` of the height and lies within REACH pixels, a block of the coder.
     """
     x, y, major, minor, angle, blur, amplitude, box = targets
     cause = np.zeros(len(x), np.int8)
@@ -444,7 +442,7 @@ def spurious(targets: Outlines, start: Ints, index: Ints) -> NDArray[np.int8]:
                 edge = major[j] * minor[j] / math.hypot(minor[j] * math.cos(turn), major[j] * math.sin(turn))
                 gap = math.hypot(dx, dy) - edge
                 halo = ratio < 0.0 and gap < minor[i] + 2.0 + 3.0 * blur[j]
-                if halo or (abs(ratio) < RINGING and gap < REACH):
+                if halo or (abs(ratio) < ringing and gap < REACH):
                     cause[i] = GLARE
             elif j < i and ratio > 0.0 and cause[j] == 0 and np.abs(box[i] - box[j]).max() <= 1:
                 cause[i] = TWICE

@@ -147,7 +147,7 @@ def background(
     around: np.ndarray = median if not ground else minimum_filter(median, 3) if ground == "dark" else maximum_filter(median, 3)
     rough = _surface(around, typical, DEGREE)
     offset = median - rough
-    bend = _bend(median)
+    bend = _bend(around)
     settle(offset, noise < SPREAD * typical, JUMP * typical + BEND * bend)
     slopes = _slopes(rough + offset, frame.shape)
     near = noise / 2 if ground else noise  # the grey of edges lies on one side of such ground: less of it gets in
@@ -164,7 +164,9 @@ def background(
     settle(offset, plausible, JUMP * usual + BEND * bend)
     doubtful = float(np.median(share)) < DOUBTFUL_SHARE or usual > DOUBTFUL_SPREAD * typical
     doubtful = doubtful or _steepest(rough + offset) > DOUBTFUL_STEP * usual
-    return Background(rough + offset, _noise(np.where(plausible, calm, np.median(calm)), float(np.median(calm)), floor, cut), frame.shape, doubtful)
+    calmest = float(np.median(calm))
+    noise = _noise(np.where(plausible, calm, calmest), calmest, floor, cut)
+    return Background(rough + offset, noise, frame.shape, doubtful)
 
 
 def scale_of(frame: np.ndarray, low_dn: float, high_dn: float) -> tuple[float, float, float]:

@@ -10,6 +10,7 @@ import numpy as np
 from pixmetry.core.errors import InputError
 from pixmetry.core.threads import map_tiles
 from pixmetry.locate.detect.background import Background, background, bands_of, scale_of
+from pixmetry.locate.detect.blocks import block_origin, coder_height_dn
 from pixmetry.locate.detect.targets import Flag, LeftOut, Targets
 
 POLARITIES = ("auto", "bright", "dark")
@@ -23,6 +24,8 @@ FARTHEST_PX = 12.0  # from the outline of a target that its skirt counts as its 
 MORE = 1.01  # area of targets that another reading of the background must show
 TWO_LEVELS = 0.8  # least share of the variance between two levels
 MOST_SEEN = 60000  # pixels
+RINGING = 0.08  # height of what rings around a target, over the target's
+CODED_RINGING = 0.2  # the same, in a frame whose blocks are visible
 BEYOND_DN = 1e30  # no grey value is so far from the background
 
 
@@ -139,7 +142,9 @@ def detect(
     found = look.detected("")
     if found.background.doubtful:
         found = look.better_reading(found)
-    return look.with_faint_ones(found) if not found.reading else found  # else the ground is a few pixels between targets
+    if not found.reading:  # else the ground is a few pixels between targets
+        found = look.with_faint_ones(found)
+    return look.without_coder(found)
 
 
 @dataclass(frozen=True)
@@ -209,8 +214,30 @@ class _Look:
             return found
         table = measure_peaks(self.frame, peaks, Map(ground.level_dn, *ground.scales), (ends[0], ends[1]))
         new = _targets(table, ground)
+        new = new[_apart(new, t)]
         both = Regions(**{f.name: np.concatenate([getattr(t, f.name), getattr(new, f.name)]) for f in fields(t)})
-        return replace(found, targets=both, polarity=_polarity(both))
+        both, left_out = _genuine(both)
+        return replace(found, targets=both, polarity=_polarity(both), left_out=LeftOut.joined([found.left_out, left_out]))
+
+    def without_coder(self, found: Detection) -> Detection:
+        """Leave out what a coder of blocks draws, where the frame went through one: of little height, or close to a higher target."""
+        origin = block_origin(self.frame) if len(found.targets) else None
+        if origin is None:
+            return found
+        targets, left_out = _genuine(found.targets, CODED_RINGING)
+        low = np.abs(targets.amplitude_dn) < coder_height_dn(self.frame, origin, found.background.image())
+        left_out = LeftOut.joined([found.left_out, left_out, seen_at(targets[low], "no higher than what the coder draws into its blocks")])
+        return replace(found, targets=targets[~low], polarity=_polarity(targets[~low]), left_out=left_out)
+
+
+def _apart(new: Regions, known: Regions) -> np.ndarray:
+    """Which of the new targets, the strongest first, hold the middle of no other one, nor lie in one; shape (n,), bool."""
+    from pixmetry.locate.detect._faint_kernels import stand_apart
+
+    names = ("x_px", "y_px", "row_first", "row_stop", "col_first", "col_stop")
+    columns = [np.concatenate([getattr(known, name), getattr(new, name)]).astype(float) for name in names]
+    apart: np.ndarray = stand_apart(np.stack(columns, axis=1), len(known))
+    return apart
 
 
 def _polarity(targets: Targets) -> str:
@@ -302,14 +329,14 @@ def _fits_box(targets: Regions) -> np.ndarray:
     return fits
 
 
-def _genuine(targets: Regions) -> tuple[Regions, LeftOut]:
+def _genuine(targets: Regions, ringing: float = RINGING) -> tuple[Regions, LeftOut]:
     """Leave out false targets that other targets cause; what is the same target found twice is not told."""
     from pixmetry.locate.detect._region_kernels import GLARE, REACH, Outlines, spurious
 
     t = targets
     box = np.stack([t.row_first, t.row_stop, t.col_first, t.col_stop], axis=1)
     outlines = Outlines(t.x_px, t.y_px, t.semi_major_px, t.semi_minor_px, t.angle_deg, t.blur_px, t.amplitude_dn, box)
-    cause = spurious(outlines, *neighbours(t, REACH))
+    cause = spurious(outlines, *neighbours(t, REACH), ringing)
     if not cause.any():
         return t, LeftOut.of()
     return t[cause == 0], seen_at(t[cause == GLARE], "a halo, or the ringing of a coder, beside a target")

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from statistics import NormalDist
+from typing import Any
 
 import numpy as np
 
@@ -11,12 +13,13 @@ from pixmetry.core.threads import map_tiles
 from pixmetry.locate.detect.background import Background, bands_of
 
 SCALES = 4  # bins of 2, 4, 8 and 16 pixels
-CLIP_SIGMA = 4.0  # further than this no pixel counts
+CLIP_SIGMA = 5.0  # further than this no pixel counts
 LEAST_BINS = 8  # a side of the frame, for a scale to be used
 BLANK = 1e-4  # a smoothed bin that is 0 but for rounding
 SEEN = 6000  # bins from which a scale's noise is taken
-SIZES_PX = (0.8, 1.2)  # of Gaussian spots that are looked for at every pixel where the smallest bins show something
+SIZES_PX = (0.8, 1.2, 1.7)  # of Gaussian spots that are looked for at every pixel where the smallest bins show something
 SHARE_TO_LOOK = 0.7  # of the threshold, at which they do
+MANY = 20  # peaks from which the skewness is taken again, without them
 LEAST_LIT = 0.6  # of the bins, beside known targets, for the noise of the rest to be known
 OUTER = 0.05  # quantiles from which the skewness of the noise is taken
 CHANCE_SKEW = 20.0  # twice the standard deviation of that skewness, times the root of the number of values
@@ -53,7 +56,7 @@ def faint_peaks(
     Returns
     -------
     ndarray, shape (n, 4)
-        x, y, score (in standard deviations of its scale's noise, negative for dark) and side of the bin, px; the strongest first.
+        x, y, score (over the threshold of its scale, negative for dark) and side of the bin, px; the strongest first.
 
     Notes
     -----
@@ -79,54 +82,110 @@ def faint_peaks(
     bins = np.empty((rows, cols), np.float32)
     map_tiles(lambda band: k.bin_heights(frame, level, reach, *band, CLIP_SIGMA, bins), bands_of(rows, threads), threads)
     k.blank_runs(bins, known, margin_px)
-    part = bins.ravel()[:: max(bins.size // (2 * SEEN), 1) | 1]
-    lit = np.sort(part[part != 0])
-    if len(lit) < LEAST_LIT * len(part):
+    lit = _lit_bins(bins)
+    if len(lit) < LEAST_LIT * len(bins.ravel()[:: _step_of(bins)]):
         return np.empty((0, k.PEAK))
-    middle, skew = float(lit[len(lit) // 2]), _skew_of(lit)  # skirts of the known targets, and what the scale cuts off, are in the map
+    middle = float(lit[len(lit) // 2])  # the skirts of the known targets, and what the scale cuts off, are in the background's map
     if len(known):
         k.fill_blanks(bins, np.float32(middle))
-    scales = [s for s in range(SCALES) if min(rows, cols) >> s >= LEAST_BINS]
-    sides = 2 if polarity == "auto" else 1
-    trials = sides * sum(rows * cols / 4**s for s in scales)
-    u, u_sharp = threshold_of(false_alarms / 2, trials), threshold_of(false_alarms / 2, sides * frame.size * len(SIZES_PX))
-    peaks = []
-    for s in scales:
-        if s:
-            bins = k.halved(bins)
-        usual = middle * 2**s * 16 / 6
-        step = max(math.isqrt(bins.size // SEEN), 1)
-        noise = _noise_of(k.smooth_sample(bins, step, step) - usual)
-        many, uneven = 4 * min(bins.shape), skew * SKEW_LEFT / 2**s
-        least = (u + (u**3 + u) / many) * noise
-        more_up, more_down = (max(sign * uneven, 0.0) * (u**2 - 1) / 6 * noise for sign in (1, -1))
-        asked = 1.0 if s else SHARE_TO_LOOK
-        low = usual - asked * (least + more_down) if polarity != "bright" else -math.inf
-        high = usual + asked * (least + more_up) if polarity != "dark" else math.inf
-        bands = bands_of(len(bins), threads)
-        found = np.concatenate(map_tiles(lambda band: k.find_peaks(bins, low, high, 2 << s, *band), bands, threads))  # noqa: B023
-        if not len(found):
-            continue
-        found[:, 2] -= usual
-        found[:, 2] *= least / (least + np.where(found[:, 2] > 0, more_up, more_down))
-        if not s:
-            sharp = found.copy()
-            k.sharpen_peaks(frame, level, reach, sharp, CLIP_SIGMA, np.array(SIZES_PX), 2)
-            asymmetry = np.maximum(np.sign(sharp[:, 2]) * uneven * SKEW_SHARP, 0.0) * (u_sharp**2 - 1) / 6
-            sharp[:, 2] *= least / (u_sharp + (u_sharp**3 + u_sharp) / many + asymmetry) / max(noise, 1.0)
-            better = np.abs(sharp[:, 2]) > np.abs(found[:, 2])
-            found[better] = sharp[better]
-            found = found[np.abs(found[:, 2]) > least]
-        found = found[_above_grain(found, ground, grain_dn)]
-        found[:, 2] *= u / least
-        peaks.append(found)
-    if not peaks:
-        return np.empty((0, k.PEAK))
-    table = np.concatenate(peaks)
-    order = np.argsort(-np.abs(table[:, 2]), kind="stable")
-    keep = k.strongest_peaks(table, order)
-    strongest: np.ndarray = table[order[keep[order]]]
-    return strongest
+    pyramid = [bins]
+    while len(pyramid) < SCALES and min(pyramid[-1].shape) >= 2 * LEAST_BINS:
+        pyramid.append(k.halved(pyramid[-1]))
+    search = _Search(frame, ground, level, reach, pyramid, middle, polarity, false_alarms, grain_dn, threads)
+    peaks = search.peaks(_skew_of(lit))
+    if len(peaks) > MANY:  # what they add to one side is not the noise's
+        rest = bins.copy()
+        k.blank_runs(rest, _runs_about(peaks, frame.shape), 0)
+        peaks = search.peaks(_skew_of(_lit_bins(rest)))
+    return peaks
+
+
+@dataclass(frozen=True)
+class _Search:
+    """The scales of a frame, and what is looked for in them."""
+
+    frame: np.ndarray
+    ground: Background
+    level: Any  # Map
+    reach: Any  # Map
+    pyramid: list[np.ndarray]
+    middle: float
+    polarity: str
+    false_alarms: float
+    grain_dn: float
+    threads: int | None
+
+    def peaks(self, skew: float) -> np.ndarray:
+        """Return the peaks of all scales, the strongest first, with the skewness of the noise in the smallest bins."""
+        from pixmetry.locate.detect import _faint_kernels as k
+
+        sides = 2 if self.polarity == "auto" else 1
+        u = threshold_of(self.false_alarms / 2, sides * sum(bins.size for bins in self.pyramid))
+        parts = []
+        for s, bins in enumerate(self.pyramid):
+            usual = self.middle * 2**s * 16 / 6
+            step = max(math.isqrt(bins.size // SEEN), 1)
+            noise = _noise_of(k.smooth_sample(bins, step, step) - usual)
+            uneven = skew * SKEW_LEFT / 2**s
+            up, down = (_enlarged(u, bins.shape, sign * uneven) * noise for sign in (1, -1))
+            share = 1.0 if s else SHARE_TO_LOOK
+            low = usual - share * down if self.polarity != "bright" else -math.inf
+            high = usual + share * up if self.polarity != "dark" else math.inf
+            bands = bands_of(len(bins), self.threads)
+            found = np.concatenate(map_tiles(lambda band: k.find_peaks(bins, low, high, 2 << s, *band), bands, self.threads))  # noqa: B023
+            if not len(found):
+                continue
+            found[:, 2] -= usual
+            if s == 0:
+                found = self._sharpened(found, uneven, max(noise, 1.0))
+            else:
+                found[:, 2] /= np.where(found[:, 2] > 0, up, down)
+            found = found[_above_grain(found, self.ground, self.grain_dn, u * noise)]
+            parts.append(found)
+        if not parts:
+            return np.empty((0, k.PEAK))
+        table = np.concatenate(parts)
+        order = np.argsort(-np.abs(table[:, 2]), kind="stable")
+        keep = k.strongest_peaks(table, order)
+        strongest: np.ndarray = table[order[keep[order]]]
+        return strongest
+
+    def _sharpened(self, found: np.ndarray, uneven: float, noise: float) -> np.ndarray:
+        """Those that pixel by pixel are above the threshold too, which a defect is not; scores over that threshold."""
+        from pixmetry.locate.detect import _faint_kernels as k
+
+        sides = 2 if self.polarity == "auto" else 1
+        u = threshold_of(self.false_alarms / 2, sides * self.frame.size * len(SIZES_PX))
+        k.sharpen_peaks(self.frame, self.level, self.reach, found, CLIP_SIGMA, np.array(SIZES_PX), 2)
+        up, down = (_enlarged(u, self.pyramid[0].shape, sign * SKEW_SHARP * uneven) * noise for sign in (1, -1))
+        found[:, 2] /= np.where(found[:, 2] > 0, up, down)
+        return found[np.abs(found[:, 2]) > 1]
+
+
+def _enlarged(u: float, shape: tuple[int, ...], skew: float) -> float:
+    """A threshold that allows for noise that is known from few rows or columns, and is skewed."""
+    return u + (u**3 + u) / (4 * min(shape)) + max(skew, 0.0) * (u**2 - 1) / 6
+
+
+def _step_of(bins: np.ndarray) -> int:
+    return max(bins.size // (2 * SEEN), 1) | 1
+
+
+def _lit_bins(bins: np.ndarray) -> np.ndarray:
+    """A part of the bins, sorted, without what is blank."""
+    part = bins.ravel()[:: _step_of(bins)]
+    return np.sort(part[part != 0])
+
+
+def _runs_about(peaks: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Runs of pixels that cover squares of three bins about peaks."""
+    x, y, _, side = peaks.T
+    first, stop = np.maximum(x - 1.5 * side, 0), np.minimum(x + 1.5 * side + 1, shape[1])
+    rows = [np.arange(max(int(v - 1.5 * s), 0), min(int(v + 1.5 * s) + 1, shape[0])) for v, s in zip(y, side, strict=True)]
+    count = np.array([len(r) for r in rows])
+    runs = np.zeros((int(count.sum()), 5), np.int32)
+    runs[:, 0], runs[:, 1], runs[:, 2] = np.concatenate(rows), np.repeat(first, count), np.repeat(stop, count)
+    return runs
 
 
 def _skew_of(values: np.ndarray) -> float:
@@ -162,9 +221,9 @@ def threshold_of(false_alarms: float, trials: float) -> float:
     return -NormalDist().inv_cdf(min(false_alarms / trials, 0.4))
 
 
-def _above_grain(peaks: np.ndarray, ground: Background, grain_dn: float) -> np.ndarray:
+def _above_grain(peaks: np.ndarray, ground: Background, grain_dn: float, threshold: float) -> np.ndarray:
     """Whether the light of a peak is more than the steps of the grey values and the bends between the background's tiles can make."""
     sigma, bend = ground.sigma(peaks[:, 0], peaks[:, 1]), ground.bend(peaks[:, 0], peaks[:, 1])
-    mean_dn = np.abs(peaks[:, 2]) * sigma * 0.375 / peaks[:, 3]  # weights 1, 2, 1 along both: white noise is √(6 · 6)/16 of a bin's
+    mean_dn = threshold * np.abs(peaks[:, 2]) * sigma * 0.375 / peaks[:, 3]  # weights 1, 2, 1: white noise is √(6 · 6)/16 of a bin's
     above: np.ndarray = mean_dn > 0.5 * grain_dn + bend
     return above

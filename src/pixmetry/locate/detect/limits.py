@@ -153,7 +153,7 @@ def _at_places(targets: Targets, places: np.ndarray) -> np.ndarray:
     return of
 
 
-def detect_within(frame: np.ndarray, limits: Limits, look: Callable[[np.ndarray], Any]) -> tuple[Regions, LeftOut, set[str]]:
+def detect_within(frame: np.ndarray, limits: Limits, look: Callable[[np.ndarray], Any]) -> tuple[Regions, LeftOut, set[str], set[str]]:
     """Detect in each region of interest; places are those of the whole frame.
 
     Parameters
@@ -170,13 +170,16 @@ def detect_within(frame: np.ndarray, limits: Limits, look: Callable[[np.ndarray]
     LeftOut
     set of str
         Polarities that were found.
+    set of str
+        "dark" and "bright", the parts that were taken as the ground where targets cover a region.
     """
-    parts, left_out, polarities = [], [], set()
+    parts, left_out, polarities, grounds = [], [], set(), set()
     for top, bottom, left, right in limits.boxes((frame.shape[0], frame.shape[1])):
         whole = (bottom - top, right - left) == frame.shape
         found = look(frame if whole else np.ascontiguousarray(frame[top:bottom, left:right]))
         t = found.targets
         polarities.add(found.polarity)
+        grounds |= {found.reading} - {""}
         lost = replace(found.left_out, x_px=found.left_out.x_px + left, y_px=found.left_out.y_px + top)
         t = replace(
             t, x_px=t.x_px + left, y_px=t.y_px + top, row_first=t.row_first + top, row_stop=t.row_stop + top, col_first=t.col_first + left,
@@ -195,4 +198,4 @@ def detect_within(frame: np.ndarray, limits: Limits, look: Callable[[np.ndarray]
 
         pairs = cKDTree(np.column_stack([targets.x_px, targets.y_px])).query_pairs(SAME_PX, output_type="ndarray")
         targets = targets[np.setdiff1d(np.arange(len(targets)), pairs[:, 1])]
-    return targets, LeftOut.joined(left_out), polarities
+    return targets, LeftOut.joined(left_out), polarities, grounds
