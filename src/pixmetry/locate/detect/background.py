@@ -21,6 +21,7 @@ SPREAD = 2.5  # times the usual spread: more is a tile with an edge in it
 STEEPEST = 0.65  # least noise of a tile over its noisiest neighbour's: from 0.63 on the bilinear continuation stays above 0
 GROUND_SHARE = {"": 0.5, "dark": 0.1, "bright": 0.9}  # of the pixels of a tile, in order, in the middle of which its ground is
 KEPT_OF_COVERED = 0.08  # as KEPT_SHARE, of a frame that targets cover
+FEW_TILES = 25  # of a frame that one target may cover
 CLIMBED = 2.0  # spread over the noise from which a mean has grey of edges in it
 DOUBTFUL_SHARE = 0.65  # of the pixels of most tiles, at the background's level, below which it may be another's
 DOUBTFUL_SPREAD = 2.0  # of the background, over the differences of neighbours
@@ -163,7 +164,7 @@ def background(
     offset = level - rough
     settle(offset, plausible, JUMP * usual + BEND * bend)
     doubtful = float(np.median(share)) < DOUBTFUL_SHARE or usual > DOUBTFUL_SPREAD * typical
-    doubtful = doubtful or _steepest(rough + offset) > DOUBTFUL_STEP * usual
+    doubtful = doubtful or level.size <= FEW_TILES or _steepest(rough + offset) > DOUBTFUL_STEP * usual
     calmest = float(np.median(calm))
     noise = _noise(np.where(plausible, calm, calmest), calmest, floor, cut)
     return Background(rough + offset, noise, frame.shape, doubtful)

@@ -21,6 +21,7 @@ THRESHOLD_SIGMA = 4.0
 LEAST_AREA_PX = 3
 FALSE_ALARMS = 0.01  # a frame
 FARTHEST_PX = 12.0  # from the outline of a target that its skirt counts as its own
+FEEBLE = 0.2  # height, over the largest one's, below which a target may be an error of the ground between many targets
 MORE = 1.01  # area of targets that another reading of the background must show
 TWO_LEVELS = 0.8  # least share of the variance between two levels
 MOST_SEEN = 60000  # pixels
@@ -194,7 +195,7 @@ class _Look:
         for reading in ("dark", "bright"):
             if self.polarity == reading:  # bright targets do not stand on the bright parts
                 continue
-            other = self.detected(reading)
+            other = _without_feeble(self.detected(reading))
             area = _target_area(other.targets)
             if area > most and _two_levels(self.frame, other):
                 best, most = other, area
@@ -210,6 +211,7 @@ class _Look:
         *ends, grain = scale_of(self.frame, self.low_dn, self.high_dn)
         margin = int(min(3 + 2 * float(np.median(t.blur_px)), FARTHEST_PX)) if len(t) else 0
         peaks = faint_peaks(self.frame, ground, found.known, self.polarity, self.false_alarms, grain, margin, self.threads)
+        peaks = peaks[np.abs(peaks[:, 2]) >= self.threshold_sigma / THRESHOLD_SIGMA]  # who asks for more contrast asks for it here too
         if not len(peaks):
             return found
         table = measure_peaks(self.frame, peaks, Map(ground.level_dn, *ground.scales), (ends[0], ends[1]))
@@ -243,6 +245,17 @@ def _apart(new: Regions, known: Regions) -> np.ndarray:
 def _polarity(targets: Targets) -> str:
     bright, dark = bool((targets.amplitude_dn > 0).any()), bool((targets.amplitude_dn < 0).any())
     return "both" if bright and dark else "bright" if bright else "dark" if dark else "none"
+
+
+def _without_feeble(found: Detection) -> Detection:
+    """Leave out what is much lower than the largest target: between many targets the map of the ground has errors."""
+    t = found.targets
+    if not len(t):
+        return found
+    height = np.abs(t.amplitude_dn)
+    feeble = height < FEEBLE * height[np.argmax(t.area_px * height)]
+    left_out = LeftOut.joined([found.left_out, seen_at(t[feeble], "low, where targets cover most of the ground")])
+    return replace(found, targets=t[~feeble], polarity=_polarity(t[~feeble]), left_out=left_out)
 
 
 def _target_area(targets: Regions) -> float:
