@@ -9,8 +9,8 @@ MOST_STEP_DN = 8  # larger steps count as this: those of targets
 STEEPER = 1.2  # steps at the borders of blocks over those inside, for a coder to be recognised
 LEAST_STEP_DN = 0.02
 EVENTFUL = 0.2  # least share of blocks that are not even, for these to be the coder's and not the targets'
-CALM = 0.25  # quantile of their heights that is the height of one pattern of the coder
-PATTERNS = 6.0  # that add up in a block, at most
+CALM = 0.4  # quantile of their heights that is the height of one pattern of the coder
+PATTERNS = 5.0  # that add up in a block, at most
 LEAST_HEIGHT_DN = 2.5  # of what a coder draws where most blocks are even: their means are rounded to a DN or two
 PARTS = 24  # of the frame that are looked at
 
