@@ -108,7 +108,7 @@ def detect(
     least_area_px : int
         Connected pixels beyond the threshold that make a region.
     threshold_sigma : float
-        Threshold in standard deviations of the background's noise.
+        Threshold in standard deviations of the background's noise. With a higher one than by default no fainter targets are looked for.
     false_alarms : float
         Greatest expected number of false targets that the matched filter finds in a frame of noise.
     threads : int, optional
@@ -143,7 +143,7 @@ def detect(
     found = look.detected("")
     if found.background.doubtful:
         found = look.better_reading(found)
-    if not found.reading:  # else the ground is a few pixels between targets
+    if not found.reading and threshold_sigma <= THRESHOLD_SIGMA:  # no ground but between targets; or no faint ones are wanted
         found = look.with_faint_ones(found)
     return look.without_coder(found)
 
@@ -211,7 +211,6 @@ class _Look:
         *ends, grain = scale_of(self.frame, self.low_dn, self.high_dn)
         margin = int(min(3 + 2 * float(np.median(t.blur_px)), FARTHEST_PX)) if len(t) else 0
         peaks = faint_peaks(self.frame, ground, found.known, self.polarity, self.false_alarms, grain, margin, self.threads)
-        peaks = peaks[np.abs(peaks[:, 2]) >= self.threshold_sigma / THRESHOLD_SIGMA]  # who asks for more contrast asks for it here too
         if not len(peaks):
             return found
         table = measure_peaks(self.frame, peaks, Map(ground.level_dn, *ground.scales), (ends[0], ends[1]))
