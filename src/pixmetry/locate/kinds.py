@@ -160,7 +160,7 @@ def locate_blobs(task: Task) -> Measured:
     """Regions of any shape."""
     from pixmetry.locate.centroids.light_moments import blob_positions
 
-    targets, left_out, polarity = find_regions(task)
+    targets, left_out, polarity, _ = find_regions(task)
     noise = _smooth_noise(task, targets)
     positions = blob_positions(task.frame, targets, noise, threads=task.threads)
     notes = _notes("light_centroid", BLOB_TEXT, noise, polarity if len(targets) else "none found")
