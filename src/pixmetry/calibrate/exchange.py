@@ -61,9 +61,7 @@ class Converted:
     share: float = 1.0
 
 
-def converted(
-    model: CameraModel, direction: Direction, names: tuple[str, ...] = NAMES, projection: Projection | None = None
-) -> Converted:
+def converted(model: CameraModel, direction: Direction, names: tuple[str, ...] = NAMES, projection: Projection | None = None) -> Converted:
     """The model in another direction or projection, or with fewer parameters: fitted all over the frame by least squares.
 
     Parameters
@@ -341,9 +339,7 @@ def vision_values(model: CameraModel) -> tuple[float, float, float, float, float
     return c * (1 + model["b1"]) / mx, c * model["b2"] / mx, c / my, model["xp"], model["yp"]
 
 
-def held(
-    model: CameraModel, names: tuple[str, ...], tolerance_px: float, who: str, projection: Projection = "perspective"
-) -> CameraModel:
+def held(model: CameraModel, names: tuple[str, ...], tolerance_px: float, who: str, projection: Projection = "perspective") -> CameraModel:
     """The model in a form that goes from object to image and has these parameters, if no more is lost than is allowed.
 
     Raises

@@ -33,7 +33,7 @@ PROJECT_ENDINGS = (".yaml", ".yml")
 # What is said with pictures, and the keys of a project's ``cameras`` and ``pictures`` that mean the same.
 CAMERA_KEYS = {name: name for name in ("camera", "interface", "direction", "projection", "c_mm", "c_px")} | {"pixel_um": "pitch_um"}
 PICTURE_KEYS = {
-    **{name: name for name in ("kind", "grid", "polarity", "channel", "raw", "noise")},
+    **{name: name for name in ("kind", "grid", "polarity", "channel", "raw", "noise", "dictionary")},
     **{f"{name}_mm": name for name in ("pitch", "side", "diameter")},
 }
 LINE_OPTIONS = {"loss": "loss", "loss_scale": "loss_scale", "snoop": "reject"}  # those of straight lines, and what they are called there
@@ -71,12 +71,12 @@ def calibrate(
     progress : callable, optional
         Called with (what, done, of).
     **pictures
-        For pictures: ``kind`` ("chessboard", "dots", "coded", "squares" or "lines"), ``grid`` ("9x6"), ``pitch_mm`` (spacing of the
-        targets), ``side_mm``, ``diameter_mm`` (of squares and dots), ``polarity``, ``channel``, ``raw`` ("1920x1200:Mono12p", of files
-        without a header), ``noise``; and of the camera: ``camera`` (a preset or camera file, which brings the pitch), ``interface``
-        ("digital" or "analogue": whether a frame grabber samples its lines), ``direction``, ``projection``, ``pixel_um`` (pitch of the
-        pixels), ``c_mm`` or ``c_px``; ``rig=True``: the names tell several cameras that stand still against each other, and their instants
-        (left01, right01).
+        For pictures: ``kind`` ("chessboard", "dots", "coded", "squares", "charuco", "aprilgrid" or "lines"), ``grid`` ("9x6"),
+        ``pitch_mm`` (spacing of the targets), ``side_mm``, ``diameter_mm`` (of squares, markers and dots), ``dictionary`` (of
+        markers), ``polarity``, ``channel``, ``raw`` ("1920x1200:Mono12p", of files without a header), ``noise``; and of the camera:
+        ``camera`` (a preset or camera file, which brings the pitch), ``interface`` ("digital" or "analogue": whether a frame
+        grabber samples its lines), ``direction``, ``projection``, ``pixel_um`` (pitch of the pixels), ``c_mm`` or ``c_px``;
+        ``rig=True``: the names tell several cameras that stand still against each other, and their instants (left01, right01).
 
     Returns
     -------

@@ -38,6 +38,7 @@ COMMANDS = {
     "chain": "Show on one page how each error source of a camera moves a target.",
     "locate": "Measure the positions of targets or lines, with their covariance.",
     "calibrate": "Calibrate a camera from images of a test field or from a table of image coordinates.",
+    "board": "Draw a test field to print, with the coordinates of its points.",
     "series": "Follow a fixed field over time: warm-up of camera and frame grabber, when it is stable.",
     "bound": "Compute how well a target can be located (Cramér–Rao bound), and what limits it.",
     "budget": "Budget every error source of a camera for a measurement, before and after calibration.",

@@ -11,7 +11,7 @@ from pixmetry.cli._console import echo, echo_lines
 from pixmetry.cli._json import JsonResult, json_option
 from pixmetry.cli._pdf import check_pdf, pdf_option, put_pdf
 
-KINDS = ("chessboard", "dots", "coded", "squares", "lines")
+KINDS = ("chessboard", "dots", "coded", "squares", "charuco", "aprilgrid", "lines")
 if TYPE_CHECKING:
     from pixmetry.report import Page
 
@@ -31,9 +31,14 @@ OPTIONS = ("field", "loss", "folds", "residual_grid", "snoop", "a_priori")
     help="Folder for the results.",
 )
 @click.option("--kind", type=click.Choice(KINDS), help="Kind of test field in the images. Default: chessboard.")
-@click.option("--grid", metavar="COLSxROWS", help="Size of the test field: inner corners of a chessboard, or dots of a plate, such as 9x6.")
+@click.option(
+    "--grid",
+    metavar="COLSxROWS",
+    help="Size of the test field: inner corners of a chessboard, squares of a charuco, dots or tags, such as 9x6.",
+)
 @click.option("--pitch-mm", type=click.FloatRange(0, min_open=True), help="Spacing of the corners or dots, mm.")
-@click.option("--side-mm", type=click.FloatRange(0, min_open=True), help="Side of separate squares, mm.")
+@click.option("--side-mm", type=click.FloatRange(0, min_open=True), help="Side of separate squares, markers or tags, mm.")
+@click.option("--dictionary", metavar="NAME", help="Of markers, such as 5X5_1000 (charuco) or APRILTAG_36h11 (aprilgrid), the defaults.")
 @click.option(
     "--diameter-mm",
     type=click.FloatRange(0, min_open=True),

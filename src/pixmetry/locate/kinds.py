@@ -256,23 +256,12 @@ def _polarity(positions: Positions) -> str:
 def locate_chessboard(task: Task) -> Measured:
     """Inner corners of a chessboard of a given size."""
     from pixmetry.locate.detect.background import background
-    from pixmetry.locate.template.corners import chessboard_reach_px, corner_positions, find_chessboard
+    from pixmetry.locate.template.corners import chessboard_reach_px, find_chessboard, measured_corners
 
     found = find_chessboard(task.frame, task.grid)
     noise = _noise_for(task, "corner", background(task.frame, low_dn=task.low_dn, high_dn=task.high_dn, threads=task.threads).sigma_dn)
     reach = chessboard_reach_px(found) if len(found) else 0.0
-
-    def place() -> Positions:
-        return corner_positions(
-            task.frame, found.x_px, found.y_px, noise, reach_px=reach, aperture_px=task.aperture_px, threads=task.threads
-        )
-
-    positions = place()
-    chi2 = positions.more["chi2_per_dof"]
-    if noise.origin == "image" and np.isfinite(chi2).any():
-        # the background's noise has the board's edges in it: the residuals of a first fit know better
-        noise = replace(noise, constant_dn2=noise.constant_dn2 * float(np.nanmedian(chi2)))
-        positions = place()
+    positions, noise = measured_corners(task.frame, found, reach, noise, aperture_px=task.aperture_px, threads=task.threads)
     columns = _columns(positions, "template", noise)
     reason = found.message or "two crossing edges, integrated over the pixel; at the Cramér–Rao bound"
     columns = beside(columns, grid_col=found.col, grid_row=found.row)

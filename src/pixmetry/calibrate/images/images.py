@@ -12,7 +12,7 @@ import numpy as np
 from pixmetry.calibrate.bundle.model import CameraModel
 from pixmetry.calibrate.bundle.network import Network
 from pixmetry.calibrate.images.numbering import consistent
-from pixmetry.calibrate.images.targets import KINDS, Seen, Wanted, board_size, see
+from pixmetry.calibrate.images.targets import DICTIONARIES, KINDS, NUMBERED, Seen, Wanted, board_size, see
 from pixmetry.camera.camera import Camera
 from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.finding import Finding
@@ -107,6 +107,7 @@ def observations_of(
     channel: str | None = None,
     raw: str | RawLayout | None = None,
     noise: NoiseModel | Camera | str | Path | None = None,
+    dictionary: str | None = None,
     least_images: int = LEAST_IMAGES,
     threads: int | None = None,
     progress: Progress | None = None,
@@ -118,15 +119,16 @@ def observations_of(
     images : sequence of path or ndarray
         Image files (PNG, TIFF, BMP, FITS, NPY, JPEG, raw), folders of them, or frames of shape (rows, cols), in the order in which they
         were taken. A file with several frames is as many images.
-    kind : {"chessboard", "dots", "squares", "coded"}
-        Inner corners of a chessboard; a plate of circular targets; corners of a plate of separate squares; coded targets anywhere.
+    kind : {"chessboard", "dots", "squares", "coded", "charuco", "aprilgrid"}
+        Inner corners of a chessboard; a plate of circular targets; corners of a plate of separate squares; coded targets anywhere; inner
+        corners of a chessboard whose bright squares hold markers; corners of a grid of AprilTags.
     grid : "COLSxROWS" or (cols, rows), optional
-        Of inner corners, dots or squares on the whole board. "any" numbers the dots of a single image that may show a part of the plate.
-        Not for coded targets.
+        Of inner corners, dots, separate squares or tags on the whole board; of a charuco board the squares. "any" numbers the dots of a
+        single image that may show a part of the plate. Not for coded targets.
     pitch : float or (float, float), optional
         Distance of neighbours along columns and rows, in the unit that object coordinates are wanted in. Not for coded targets.
     side : float, optional
-        Of the separate squares, in the same unit.
+        Of the separate squares, markers or tags, in the same unit.
     diameter : float, optional
         Of circular targets, in the same unit, for the correction of their eccentricity.
     polarity : {"auto", "bright", "dark"}
@@ -137,6 +139,8 @@ def observations_of(
         Of files without a header: ``"1920x1200:Mono12p"``.
     noise : optional
         As in `pixmetry.locate`; by default it is measured in each image.
+    dictionary : str, optional
+        Of the markers: ``5X5_1000`` of a charuco board and ``APRILTAG_36h11`` of tags by default.
     least_images : int
         From how many usable images on there is a result.
     threads : int, optional
@@ -162,7 +166,10 @@ def observations_of(
         raise InputError("no such polarity", where="polarity", value=polarity, allowed="auto, bright, dark")
     sides = (np.nan, np.nan) if side is None else (side / step[0], side / step[1])
     layout = layout_of(raw)
-    wanted = Wanted(kind, size, sides, polarity, channel, noise_model(noise), threads, layout)
+    if dictionary is not None and kind not in DICTIONARIES:
+        raise InputError("a dictionary is one of markers", where="dictionary", value=dictionary, allowed="with charuco or aprilgrid")
+    markers = dictionary or DICTIONARIES.get(kind, "")
+    wanted = Wanted(kind, size, sides, polarity, channel, noise_model(noise), threads, layout, markers)
     items = _items(images, layout)
     told = progress or no_progress
     seen: list[Seen] = []
@@ -216,7 +223,7 @@ def _checked_lengths(
         along = across = np.nan
     if not (0 < along < np.inf and 0 < across < np.inf):
         raise InputError("the spacing of the points on the board is missing", where="pitch", value=pitch, allowed="a length above 0")
-    if kind == "squares" and not (side is not None and 0 < side < min(along, across)):
+    if kind in ("squares", *DICTIONARIES) and not (side is not None and 0 < side < min(along, across)):
         raise InputError("the side of the squares is missing", where="side", value=side, allowed="a length between 0 and the pitch")
     return along, across
 
@@ -263,7 +270,7 @@ def _check_enough(seen: list[Seen], good: list[Seen], wanted: Wanted, least: int
 
 def _numbered(good: list[Seen], kind: str) -> tuple[list[Seen], tuple[Finding, ...]]:
     """The same corner of the board is the first one in all images."""
-    if kind == "coded":
+    if kind in NUMBERED:
         return good, ()
     rows, cols = good[0].extent
     boards, findings = consistent([s.board for s in good], chessboard_turns(rows, cols) if kind == "chessboard" else None)
@@ -292,7 +299,7 @@ def _nominal(keys: np.ndarray, kind: str, pitch: tuple[float, float], side: floa
     if kind == "coded":
         return tuple(str(k) for k in keys[:, 0]), np.full((len(keys), 3), np.nan)
     row, col = keys.T
-    if kind != "squares":
+    if kind not in ("squares", "aprilgrid"):
         return tuple(f"{r}/{c}" for r, c in keys), np.column_stack([col * pitch[0], row * pitch[1], np.zeros(len(keys))])
     corner = np.where(row % 2 == 0, col % 2, 3 - col % 2)
     names = tuple(f"{r // 2}/{c // 2}.{k}" for r, c, k in zip(row, col, corner, strict=True))

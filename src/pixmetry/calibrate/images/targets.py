@@ -13,14 +13,19 @@ from pixmetry.core.errors import InputError
 from pixmetry.files.formats import Decoded
 from pixmetry.files.images import load_picture
 from pixmetry.files.raw_values import RawLayout
+from pixmetry.locate.detect.grids import Grid
 from pixmetry.locate.detect.targets import Flag, Positions
 from pixmetry.locate.frame import checked_frame, scale_ends
 from pixmetry.locate.job import locate
-from pixmetry.locate.noise import NoiseModel
+from pixmetry.locate.noise import ROUNDING_DN2, NoiseModel
 from pixmetry.locate.records import Located
 
-KINDS = ("chessboard", "dots", "squares", "coded")
+KINDS = ("chessboard", "dots", "squares", "coded", "charuco", "aprilgrid")
+NUMBERED = ("coded", "charuco", "aprilgrid")  # whose targets carry numbers: part of a board suffices
+DICTIONARIES = {"charuco": "5X5_1000", "aprilgrid": "APRILTAG_36h11"}  # of markers, unless another one is named
 LEAST_SHARE = 0.5  # of a board's points, that an image must show to be used
+MARKER_GAP, MARKER_CLEARANCE_PX = 0.7, 2.0  # from a corner to the next marker, over what that leaves of a square; for its blur
+LEAST_NUMBERED, MOST_MOVED_PX = 8, 6.0  # corners in an image; of one from where it was seen
 LEAST_CODES = 4  # targets in an image
 UNUSABLE = Flag.NOT_CONVERGED | Flag.BORDER
 
@@ -31,15 +36,17 @@ class Wanted:
 
     Parameters
     ----------
-    kind : {"chessboard", "dots", "squares", "coded"}
+    kind : {"chessboard", "dots", "squares", "coded", "charuco", "aprilgrid"}
     grid : (int, int) or None
         Columns and rows of the whole board; None: not known, or there is none.
     side : (float, float)
-        Of the squares of a plate, in units of the pitch along columns and along rows.
+        Of the squares of a plate, of markers or tags, in units of the pitch along columns and along rows.
     polarity, channel, noise, threads
         As in `pixmetry.locate`.
     raw : RawLayout, optional
         Of files without a header.
+    dictionary : str
+        Of markers.
     """
 
     kind: str
@@ -50,11 +57,15 @@ class Wanted:
     noise: NoiseModel | None = None
     threads: int | None = None
     raw: RawLayout | None = None
+    dictionary: str = ""
 
     @property
     def whole(self) -> int:
         """Points of the whole board; 0 where it has no size."""
-        return 0 if self.grid is None else self.grid[0] * self.grid[1] * (4 if self.kind == "squares" else 1)
+        if self.grid is None:
+            return 0
+        cols, rows = self.grid
+        return (cols - 1) * (rows - 1) if self.kind == "charuco" else cols * rows * (4 if self.kind in ("squares", "aprilgrid") else 1)
 
 
 @dataclass(frozen=True)
@@ -114,7 +125,7 @@ def see(name: str, source: Path | np.ndarray, wanted: Wanted) -> Seen:
     missing = wanted.whole - len(seen.keys)
     if seen.reason or wanted.grid is None or missing <= 0:
         return seen
-    if len(seen.keys) < LEAST_SHARE * wanted.whole:
+    if wanted.kind not in NUMBERED and len(seen.keys) < LEAST_SHARE * wanted.whole:
         return _nothing(name, frame, f"only {len(seen.keys)} of {wanted.whole} points were found")
     return replace(seen, note=f"{missing} of {wanted.whole} points were not found or not identified")
 
@@ -186,7 +197,63 @@ def _coded(name: str, frame: np.ndarray, wanted: Wanted) -> Seen:
     return replace(seen, note=f"codes seen more than once are not used: {twice}" if twice else "")
 
 
-_FINDERS = {"chessboard": _chessboard, "dots": _dots, "squares": _squares, "coded": _coded}
+def _charuco(name: str, frame: np.ndarray, wanted: Wanted) -> Seen:
+    from pixmetry.locate.detect.tags import find_charuco
+    from pixmetry.locate.template.corners import default_reach_px, measured_corners
+
+    assert wanted.grid is not None
+    grid = find_charuco(frame, wanted.grid, min(wanted.side), wanted.dictionary)
+    if grid.message:
+        return _nothing(name, frame, grid.message)
+    # up to the markers, which are alike on both sides of a corner
+    reach = default_reach_px(grid.x_px, grid.y_px, MARKER_GAP * (1 - min(wanted.side)), MARKER_CLEARANCE_PX)
+    found, _ = measured_corners(frame, grid, reach, _noise_of(frame, wanted), threads=wanted.threads)
+    return _numbered(name, frame, found, grid)
+
+
+def _aprilgrid(name: str, frame: np.ndarray, wanted: Wanted) -> Seen:
+    from pixmetry.locate.detect.squares import square_corners
+    from pixmetry.locate.detect.tags import find_tag_grid
+    from pixmetry.locate.template.corners import default_reach_px, measured_corners
+
+    assert wanted.grid is not None
+    grid, joined = find_tag_grid(frame, wanted.grid, wanted.side, wanted.dictionary)
+    if grid.message:
+        return _nothing(name, frame, grid.message)
+    noise = _noise_of(frame, wanted)
+    if joined:
+        found, _ = measured_corners(frame, grid, default_reach_px(grid.x_px, grid.y_px), noise, threads=wanted.threads)
+    else:
+        corners = np.stack([grid.x_px, grid.y_px], axis=1).reshape(-1, 4, 2)
+        dark, bright = np.quantile(frame, (0.05, 0.95))
+        height, ground = float(dark - bright), float(bright)
+        found = square_corners(frame, corners, noise, amplitude_dn=height, background_dn=ground, threads=wanted.threads)
+    return _numbered(name, frame, found, grid)
+
+
+def _numbered(name: str, frame: np.ndarray, found: Positions, grid: Grid) -> Seen:
+    """Corners of markers that were identified, without those that the fit moved where their neighbours do not expect them."""
+    use, keys = _usable(found), np.column_stack([grid.row, grid.col])
+    if use.sum() >= LEAST_NUMBERED:
+        moved = np.hypot(found.x_px - grid.x_px, found.y_px - grid.y_px)
+        use &= np.nan_to_num(moved, nan=np.inf) < MOST_MOVED_PX
+    if use.sum() < LEAST_NUMBERED:
+        return _nothing(name, frame, f"{int(use.sum())} numbered corners could be measured, {LEAST_NUMBERED} are needed")
+    return _seen(name, frame, found, keys, use, (grid.rows, grid.cols))
+
+
+def _noise_of(frame: np.ndarray, wanted: Wanted) -> NoiseModel:
+    """The given noise, with the ends of the scale; else that of the background, which the residuals of the fits correct."""
+    from pixmetry.locate.detect.background import background
+
+    low, high = scale_ends(frame, None, wanted.noise)
+    if wanted.noise is not None:
+        return replace(wanted.noise, low_dn=max(low, wanted.noise.low_dn), high_dn=min(high, wanted.noise.high_dn))
+    sigma = float(np.median(background(frame, low_dn=low, high_dn=high, threads=wanted.threads).sigma_dn))
+    return NoiseModel(max(sigma**2, ROUNDING_DN2 if frame.dtype.kind == "u" else 1e-12), low_dn=low, high_dn=high, origin="image")
+
+
+_FINDERS = {"chessboard": _chessboard, "dots": _dots, "squares": _squares, "coded": _coded, "charuco": _charuco, "aprilgrid": _aprilgrid}
 
 
 def board_size(kind: str, grid: str | tuple[int, int] | None) -> tuple[int, int] | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -246,21 +247,38 @@ def corner_positions(
     return _positions(reach, fits)
 
 
+def measured_corners(
+    frame: np.ndarray, grid: Grid, reach_px: np.ndarray | float, noise: NoiseModel, *, aperture_px: float = 1.0, threads: int | None = None
+) -> tuple[Positions, NoiseModel]:
+    """Place the corners of a board; where the noise is that of the image, with what the residuals of a first fit tell of it."""
+
+    def place() -> Positions:
+        return corner_positions(frame, grid.x_px, grid.y_px, noise, reach_px=reach_px, aperture_px=aperture_px, threads=threads)
+
+    positions = place()
+    chi2 = positions.more["chi2_per_dof"]
+    if noise.origin == "image" and np.isfinite(chi2).any():
+        # the background's noise has the board's edges in it: the residuals of a first fit know better
+        noise = replace(noise, constant_dn2=noise.constant_dn2 * float(np.nanmedian(chi2)))
+        positions = place()
+    return positions, noise
+
+
 def _empty(n: int) -> kernels.Fits:
     """Room for the fits of n corners."""
     integers = np.zeros(n, np.int64), np.zeros(n, np.int64)
     return kernels.Fits(np.full((n, kernels.ALL), np.nan), np.full((n, 3), np.nan), np.full(n, np.nan), *integers)
 
 
-def default_reach_px(x_px: np.ndarray, y_px: np.ndarray) -> np.ndarray:
-    """Radius of the windows, shape (n,), from how near the nearest other corner is."""
+def default_reach_px(x_px: np.ndarray, y_px: np.ndarray, share: float = 0.85, clearance_px: float = CLEARANCE_PX) -> np.ndarray:
+    """Radius of the windows, shape (n,): a share of the distance of the nearest other corner, less a clearance for the next edge's blur."""
     from scipy.spatial import cKDTree
 
     if len(x_px) < 2:
         return np.full(len(x_px), REACH_PX)
     place = np.stack([x_px, y_px], axis=1)
     nearest = cKDTree(place).query(place, k=2)[0][:, 1]
-    reach: np.ndarray = np.clip(0.85 * nearest - CLEARANCE_PX, LEAST_REACH_PX, REACH_PX)
+    reach: np.ndarray = np.clip(share * nearest - clearance_px, LEAST_REACH_PX, REACH_PX)
     return reach
 
 
