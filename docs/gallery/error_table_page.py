@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
 import pixmetry
+from gallery.item import Item
 from gallery.line_jitter import AVERAGED, stored
 from gallery.page import Page, table
 from pixmetry.budget.camera_budget import CameraBudget
@@ -85,9 +87,31 @@ Written by `scripts/make_handbook.py` from `gallery.error_table_page`; it writes
 """
 
 
+@lru_cache(maxsize=1)
+def chapter_budget() -> CameraBudget:
+    """The budget of a round target in the chapter's conditions."""
+    return pixmetry.budget(CAMERA, SCENARIO, estimator=ESTIMATOR)
+
+
+def items() -> list[Item]:
+    """The chapter's numbers."""
+    budget = chapter_budget()
+    starred = {r.number: r.stars for r in budget.rows if r.number}
+    line = (
+        "differs because its residuals are of single rows of lines, with more noise and uneven light; a round target averages over its rows"
+    )
+    return [
+        Item.judged("T3.1 errors", "rows of the error table", "E", 39, len(starred), 0),
+        Item.judged(
+            "T3.2e", "budget of a round target after calibration, x / px", "V", CHAPTER_PX[0], budget.one.after_px[0], 0.01, otherwise=line
+        ),
+        Item.judged("T3.2f", "the same, y / px", "V", CHAPTER_PX[1], budget.one.after_px[1], 0.01, otherwise=line),
+    ]
+
+
 def page() -> Page:
     """Compute the table and write the page."""
-    budget = pixmetry.budget(CAMERA, SCENARIO, estimator=ESTIMATOR)
+    budget = chapter_budget()
     warm = [r for r in budget.rows if r.number]
     rows = sorted(warm, key=lambda r: (r.number, r.source_id))
     return Page("error-table", _text(budget, rows, _older()))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from gallery.item import Item
 from gallery.line_jitter import FRAMES, PIXEL_NS, Level, stored
 from gallery.line_jitter_frames import AVERAGED, LENSES, LINES, POSITIONS, PRESET, VIEWS
 from gallery.page import Page, show, table
@@ -293,3 +294,30 @@ def _equal_ns() -> float:
     """Jitter whose contribution to the residuals equals that of everything else."""
     run = stored()
     return float(run.levels[0].x.rms_px * np.sqrt(AVERAGED) * PIXEL_NS / run.gain)
+
+
+def items() -> list[Item]:
+    """The chapter's numbers."""
+    none, one = stored().levels[:2]
+    test, _, _ = _chapter()
+    rows = found(one, "rows")["jitter_ns"]
+    quality = "differs because its lines were a few pixels wide, unevenly lit and with ringing, and its estimator is not told; here {}"
+    shown = "noise, fixed patterns and the lens model leave {:.4f} px without jitter"
+    size = [Item.judged(f"T3.2{k}", f"residual along {axis} / px", "V", 1 / n, left.rms_px, 0.01,
+                        otherwise=quality.format(shown.format(left.rms_px)))
+            for k, axis, n, left in (("a", "x", 25, none.x), ("b", "y", 28, none.y))]  # fmt: skip
+    ratio = test.ratio_px2
+    upright, lying = np.nanstd(stored().example_px[0], axis=1)
+    return [
+        Item.judged("Fig 3.23ab", "scatter on one upright line over that on a lying one, no jitter", "V", 1.0, upright / lying, 0.25,
+                    why="the chapter sees no difference between x and y"),
+        *size,
+        Item.judged("T3.2c", "0.341 µm in pixels of 8.6 µm", "E", 1 / 25, CHAPTER_UM[0] / 8.6, 0.0005, why="printed: 1/25"),
+        Item.judged("T3.2d", "0.291 µm in pixels of 8.3 µm", "E", 1 / 28, CHAPTER_UM[1] / 8.3, 0.0007, why="printed: 1/28; it is 1/28.5"),
+        Item.judged("N20", "positions on lines in all images", "E", 34560, 2 * LINES * POSITIONS * len(VIEWS), 0, why="8 · 80 · 27 · 2"),
+        Item.judged("N26a", "variance along x over that along y, its own residuals in px", "E", 1.0, ratio, 0.25,
+                    otherwise=f"chapter inconsistent: (0.341/8.6)² / (0.291/8.3)² = {ratio:.3f} is above the critical 1.25 (one-sided 5 %, "
+                    "216 degrees of freedom each), so there is evidence, although its cause need not be jitter"),
+        Item.judged("N26b", "jitter of 1 ns, measured from the rows of one frame / ns", "V", 1.0, rows.value, 0.05, rows.u,
+                    why="expected: as simulated; a grabber's nanoseconds can be seen"),
+    ]  # fmt: skip

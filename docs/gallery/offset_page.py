@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gallery import offset as experiment
+from gallery.item import Item
 from gallery.offset import (
     BLACK_DN,
     NOISE_DN,
@@ -300,3 +301,35 @@ it is not significant here).
 Written by `scripts/make_handbook.py` from `gallery.offset`; it writes the same numbers in every run.
 """
     return Page("offset", text.replace("px, -", f"px, {MINUS}"), pictures)
+
+
+def items() -> list[Item]:
+    """The chapter's statements with a number."""
+    six, none, rounded = swing(OFFSET_DN, "rounded"), swing(0.0), swing(0.0, "rounded")
+    stray, rule = experiment.outlier_shift()
+    periods = float(np.abs(np.fft.rfft(swing(OFFSET_DN).error_px)).argmax())
+    seen = experiment.exposures()
+    before, after = (float(np.ptp(seen.error_px[offset])) for offset in (40.0, 6.0))
+    u_before, u_after = (float(np.hypot(seen.u_px[o][0], seen.u_px[o][-1])) for o in (40.0, 6.0))
+    deep = max(abs(swing(share * PEAK_DN, sigma_px=sigma).first_px) for sigma in (0.8, 1.0, 1.2) for share in (0.5, 0.6, 0.7, 0.8))
+    tails = "differs because rounding also cuts off the feet below half a grey value; without it the line is straight"
+    weak = (
+        "differs because its band of 0.4 px needs a larger share cut off than 40 of 220 to 60 grey values; "
+        f"amplitudes of up to {deep:.2f} px, as in Fig 3.15, come from more than half of the peak"
+    )
+    return [
+        Item.judged("Fig 3.13", "largest error with an offset of 6, rounded / px", "S", 0.01, six.half_range_px, 0.01,
+                    why="expected: a wave within the axis of ±0.02 px"),
+        Item.judged("N13", "periods of the wave while the line shifts by 3 px", "S", 3.0, periods, 0,
+                    why="strongest wave of the error without rounding; one period a pixel"),
+        Item.judged("Fig 3.14a", "largest error without an offset, not rounded / px", "S", 0.0, round(none.half_range_px, 12), 1e-12),
+        Item.judged("Fig 3.14b", "the same, rounded to 8 bits / px", "S", 0.0, rounded.half_range_px, 0.005, otherwise=tails),
+        Item.judged("Fig 3.15", "largest amplitude, half to four fifths of the peak cut off / px", "S", 0.3, deep, 0.1,
+                    why="expected: the axis, ±0.3 px"),
+        Item.judged("Fig 3.16", "shift of a row by a stray value of 1 at 10 px / px", "S", rule, stray, 0.001,
+                    why="expected: value · distance / sum"),
+        Item.judged("Fig 3.17a", "range of the places of a target at four exposures, 40 cut off / px", "S", 0.4, before, 0.05, u_before,
+                    otherwise=weak),
+        Item.judged("Fig 3.17b", "the same, 6 cut off / px", "S", 0.0, after, 0.02, u_after,
+                    why="levels of the three exposures differ little"),
+    ]  # fmt: skip

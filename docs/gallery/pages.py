@@ -50,8 +50,9 @@ EXPERIMENTS = {  # pages with modules of their own: where in the chapter, title,
     ),
 }  # fmt: skip
 ORDER = (
-    "error-table", "camera-data", "grabber-warm-up", "sampling-clock", "laser-speckle", "interlace", "gamma", "threshold", "unflatness",
-    "cable", "window-offset", "offset", "camera-warm-up", "charge-transfer", "amplifier-noise", "line-jitter", "fixed-pattern",
+    "error-table", "camera-data", "grabber-warm-up", "sampling-clock", "laser-speckle", "interlace", "gamma", "video-tape", "threshold",
+    "unflatness", "cable", "window-offset", "offset", "camera-filter", "camera-warm-up", "charge-transfer", "amplifier-noise",
+    "quantisation", "line-jitter", "fixed-pattern", "super-resolution", "pixel-places",
 )  # as in the chapter  # fmt: skip
 NOTES = tuple(name for name in ORDER if name not in EXPERIMENTS)
 
@@ -81,6 +82,7 @@ def make_gallery(run: Collection[str] = NOTES) -> Gallery:
         if name in EXPERIMENTS:
             module, where, title, what = EXPERIMENTS[name]
             pages[name] = module.page()
+            items += [(name, item) for item in module.items()]
         else:
             note = Note.read(name)
             numbers[name], pictures = note.run() if name in run or name not in numbers else (numbers[name], ())
