@@ -95,7 +95,7 @@ class Item:
 def comparison(items: Iterable[Item]) -> str:
     """The table of a page: chapter, ours, and why they differ."""
     rows = [[i.id, i.what, *i.numbers, number(i.tolerance), i.verdict_head, i.why] for i in items]
-    head = ["item", "quantity", "chapter", "ours", "u", "tolerance", "verdict", "why"]
+    head = ["item", "quantity", "expected", "ours", "u", "tolerance", "verdict", "why"]
     lines = table(head, rows, 2).split("\n")
     lines[1] = "| --- | --- | ---: | ---: | ---: | ---: | --- | --- |"
     return "\n".join(lines)

@@ -24,7 +24,9 @@ measured minus true. Grey values are those of 8 bits.
 
 ## Every figure, table and number
 
-Kinds: {kinds}. A value agrees if it lies within the tolerance of the chapter's; its page tells why the others do not. {count}
+Kinds: {kinds}.
+"Expected" is what the chapter prints, or what follows from it or from the simulated camera: the page tells which. A value agrees if it lies
+within the tolerance of that; the page tells why the others do not. {count}
 The same table, with the reasons, is in [gallery.json](gallery.json).
 
 {items}
@@ -115,7 +117,7 @@ def write(folder: Path, run: Collection[str] = NOTES) -> list[Path]:
 
 def _summary(items: list[tuple[str, Item]]) -> str:
     rows = [[f"[{i.id}]({page}.md)", i.what, i.kind, *i.numbers, i.verdict_head] for page, i in items]
-    lines = table(["item", "quantity", "kind", "chapter", "ours", "u", "verdict"], rows, 3).split("\n")
+    lines = table(["item", "quantity", "kind", "expected", "ours", "u", "verdict"], rows, 3).split("\n")
     return "\n".join([lines[0], "| --- | --- | --- | ---: | ---: | ---: | --- |", *lines[2:]])
 
 
