@@ -35,6 +35,7 @@ from pixmetry.locate.centroids._moment_kernels import (
 PERIMETER, FORSTNER, ELLIPSE_EDGES, GAUSSIAN = 0, 1, 2, 3
 GRADIENT_NOISE = 2.0 * (9.0 + 100.0 + 9.0) / 1024.0  # variance of one component of Scharr's gradient per variance of a pixel
 MOST_RAYS = 192
+ROUND = 1.2  # ratio of the axes of an ellipse that is drawn as a disc is: the plateau in one go
 GAUSSIAN_UNKNOWNS = 7
 GAUSSIAN_REST = 1e-10  # of the squared residuals: fall at which the fit of a Gaussian is at rest
 
@@ -553,6 +554,14 @@ def operators(frame: np.ndarray, record: Array, first: int, stop: int, operator:
         at_rest[i] = operator_of(frame, record, i, operator, noise, patch, answer, box, sums, result[i])
 
 
+@jit(inline="always")
+def radial_place(p: float, q: float, r: float, dx: float, dy: float, edge: float, step: float) -> float:
+    """Place in a radial profile of what is at (dx, dy) from the centre of an ellipse, by the distance along the outline's normal."""
+    gx, gy = p * dx + q * dy, q * dx + r * dy
+    form = math.sqrt(max(gx * dx + gy * dy, 1e-12))
+    return (edge + (form - 1.0) * form / max(math.sqrt(gx * gx + gy * gy), 1e-12)) / step - 0.5
+
+
 @jit
 def draw_target(
     image: Singles, x: float, y: float, major: float, minor: float, angle: float, edge: float, profile: Array, step: float
@@ -565,15 +574,26 @@ def draw_target(
     at = np.array([-0.453089922969332, -0.26923465505284155, 0.0, 0.26923465505284155, 0.453089922969332])
     weight = np.array([0.11846344252809454, 0.23931433524968324, 0.28444444444444444, 0.23931433524968324, 0.11846344252809454])
     last = profile.shape[0] - 1
+    flat, dark = -1, last  # up to where the profile is 1, and from where it is 0: all of a pixel is alike there
+    while flat < last and profile[flat + 1] == 1.0:
+        flat += 1
+    while dark > 0 and profile[dark - 1] == 0.0:
+        dark -= 1
+    even = flat >= 0 and major < ROUND * minor  # inside of a slim ellipse, distances from the outline do not grow evenly
+    room = 0.7 * (major / minor) ** 2 / step + 1.0  # from a pixel's middle to its corners
     for row in range(image.shape[0]):
         for col in range(image.shape[1]):
+            place = radial_place(p, q, r, col - x, row - y, edge, step)
+            if even and place + room < flat:
+                image[row, col] = 1.0
+                continue
+            if place - room > dark:
+                image[row, col] = 0.0
+                continue
             total = 0.0
             for a in range(5):
                 for b in range(5):
-                    dx, dy = col + at[b] - x, row + at[a] - y
-                    gx, gy = p * dx + q * dy, q * dx + r * dy
-                    form = math.sqrt(max(gx * dx + gy * dy, 1e-12))
-                    place = (edge + (form - 1.0) * form / max(math.sqrt(gx * gx + gy * gy), 1e-12)) / step - 0.5
+                    place = radial_place(p, q, r, col + at[b] - x, row + at[a] - y, edge, step)
                     if place <= 0.0:
                         light = profile[0]
                     elif place >= last:

@@ -676,14 +676,34 @@ def add_row_shifts(answers: Array, used: Ints, noise: Noise, variance: Array, co
             before[a] = ALIKE * (before[a] + own[a])
 
 
+@jit(**DOT)
+def leverages(images: Array, weight: Array, inverse: Array, count: int, scratch: Array, out: Array) -> None:
+    """Write w Jᵀ (JᵀWJ)⁻¹ J of every pixel, for the first ``count`` derivatives; pixels in the innermost loop fill the registers."""
+    size = weight.size
+    w, total, along = weight.reshape(size), out.reshape(size), scratch[:size]
+    total[:] = 0.0
+    for a in range(count):
+        column = images[1 + a].reshape(size)
+        for i in range(size):
+            along[i] = inverse[a, a] * column[i]
+        for b in range(a):
+            other, twice = images[1 + b].reshape(size), 2.0 * inverse[a, b]
+            for i in range(size):
+                along[i] += twice * other[i]
+        for i in range(size):
+            total[i] += column[i] * along[i]
+    for i in range(size):
+        total[i] *= w[i]
+
+
 @jit
 def residuals(
-    frame: NDArray[np.generic], model: Model, parameters: Array, slopes: int, which: Ints, about: About
+    frame: NDArray[np.generic], model: Model, parameters: Array, slopes: int, which: Ints, about: About, rows: bool
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Return what the pixels of fitted targets leave: levels, residuals/√(1 − leverage), slopes of the mean in DN per pixel; of their rows
-    (at most `ROWS` a target) the scores Σ w µ_x (d − µ), and the covariance of these under white noise.
+    """Return what the pixels of fitted targets leave: levels, residuals/√(1 − leverage), slopes of the mean in DN per pixel; or, with
+    ``rows``, of their rows (at most `ROWS` a target) the scores Σ w µ_x (d − µ), and the covariance of these under white noise.
 
-    The first ``slopes`` parameters of the planes were among the unknowns.
+    The first ``slopes`` parameters of the planes were among the unknowns. What is not asked for is empty, or 0.
     """
     kind = model.kind
     count = SHAPES[kind] + 5 + slopes
@@ -718,19 +738,19 @@ def residuals(
                 unit[:count] = 0.0
                 unit[a] = 1.0
                 substitute(system.factor, count, unit, inverse[a])
+        if rows:
+            row_scores(window, used, system, scores[w], spread[w])
+            continue
+        leverages(images, weight, inverse, count, system.scratch, kept)
         for r in range(side):
             for c in range(side):
                 if window.mask[r, c] == 0.0:
                     continue
-                left = 1.0
-                for a in range(count):
-                    for b in range(count):
-                        left -= weight[r, c] * inverse[a, b] * images[1 + a, r, c] * images[1 + b, r, c]
+                left = 1.0 - kept[r, c]
                 if left > 0.1:
                     levels[total], found[total] = images[0, r, c], residual[r, c] / math.sqrt(left)
                     steep[total] = math.hypot(images[1, r, c], images[2, r, c])
                     total += 1
-        row_scores(window, used, system, scores[w], spread[w])
     return levels[:total], found[:total], steep[:total], scores, spread
 
 

@@ -91,7 +91,7 @@ def noise_from_image(
     windows = Windows.of(frame, targets, guess, kind, aperture_px, True, False)
     start = None
     for step in range(PASSES):
-        left = _leftovers(windows, targets, which, guess, kind, threads, start)
+        left = _leftovers(windows, targets, which, guess, kind, threads, start, rows=False)
         before, guess, start = guess, _fitted(left, guess, least), left.parameters
         if step and _alike(before, guess, left.level):
             break
@@ -122,13 +122,13 @@ def _with_row_shifts(
     start: np.ndarray | None,
 ) -> NoiseModel:
     """The noise with what rows are shifted against each other; where columns are so as well, it is the shape that does not fit."""
-    rows = row_shifts(_leftovers(windows, targets, which, noise, kind, threads, start))
+    rows = row_shifts(_leftovers(windows, targets, which, noise, kind, threads, start, rows=True))
     if not any(rows):
         return noise
     turned = transposed(targets)
     frame = np.ascontiguousarray(windows.frame.T)
     aside = Windows.of(frame, turned, noise, kind, windows.aperture_px, True, False)
-    columns = row_shifts(_leftovers(aside, turned, which, noise, kind, threads, None))
+    columns = row_shifts(_leftovers(aside, turned, which, noise, kind, threads, None, rows=True))
     if math.hypot(*columns) > ROWS_ALONE * math.hypot(*rows):
         return noise
     return replace(noise, row_shift_px=rows[0], field_shift_px=rows[1])
@@ -190,8 +190,10 @@ def _leftovers(
     kind: str,
     threads: int | None,
     start: np.ndarray | None,
+    *,
+    rows: bool,
 ) -> Leftovers:
-    """Fit some of the targets and look at what is left."""
+    """Fit some of the targets and look at what is left: of pixels, or of rows."""
     windows = replace(windows, noise=noise)
     first = windows.start if start is None else start
     # planes, so that light or a ground that slopes is not taken for noise; small targets cannot tell them from the rest
@@ -203,7 +205,7 @@ def _leftovers(
     model = windows.model
 
     def piece(good: np.ndarray) -> tuple[np.ndarray, ...]:
-        return residuals(windows.frame, model, fitted.parameters, slopes, good, windows.about)
+        return residuals(windows.frame, model, fitted.parameters, slopes, good, windows.about, rows)
 
     pieces = map_tiles(piece, np.array_split(np.flatnonzero(fitted.at_rest), PIECES), threads)
     level, residual, steep, score, spread = (np.concatenate(values) for values in zip(*pieces, strict=True))
