@@ -25,6 +25,7 @@ from scipy.spatial import cKDTree
 
 from pixmetry.core.threads import set_threads
 from pixmetry.locate.job import locate
+from pixmetry.locate.track.tracker import Tracker
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from locate import line_frames, rendered  # noqa: E402
@@ -200,6 +201,30 @@ def many(rng: np.random.Generator) -> None:
         print(score.line(f"20 000 targets: {name}"))
 
 
+def sequences(frame: Frame, repeats: int) -> tuple[float, float]:
+    """Tracking: milliseconds a call for a region of 64 × 64 pixels with one disc, and microseconds a target of the whole frame."""
+    middle = int(np.argmin(np.hypot(frame.x - 1024, frame.y - 1024)))
+    row, col = int(frame.y[middle]) - 32, int(frame.x[middle]) - 32
+    region = np.ascontiguousarray(frame.image[row : row + 64, col : col + 64])
+    one, all_of_them = Tracker(region, threads=1), Tracker(frame.image, threads=THREADS)
+    call_s = best_s(lambda: one.update(region), 500 * repeats)
+    plain_s = best_s(lambda: locate(region, estimator="soft_threshold", threads=1), 5 * repeats)
+    whole_s = best_s(lambda: all_of_them.update(frame.image), 2 * repeats)
+    print(f"tracking, soft_threshold: {1e3 * call_s:.3f} ms a call for 64 × 64 pixels ({len(one)} targets; locate {1e3 * plain_s:.2f} ms)")
+    print(
+        f"tracking, soft_threshold: {1e3 * whole_s:.1f} ms a frame, {1e6 * whole_s / len(all_of_them):.1f} µs a target, {1 / whole_s:.0f} frames/s"
+    )
+    if peers.available("cv2"):
+        import cv2
+
+        def by_components() -> object:
+            level = float(frame.image.mean() + 85)
+            return cv2.connectedComponentsWithStats(cv2.threshold(region, level, 255, cv2.THRESH_BINARY)[1])
+
+        print(f"OpenCV, threshold and connected components of 64 × 64 pixels: {1e3 * best_s(by_components, 100 * repeats):.3f} ms")
+    return 1e3 * call_s, each_us
+
+
 def lines(rng: np.random.Generator, repeats: int) -> tuple[float, float, float]:
     """Lines a second of the template alone, and the rms error of its offsets and of the row-wise squared centroid's over the bound."""
     from pixmetry.locate.lines.line_detection import find_lines
@@ -253,6 +278,7 @@ def main() -> None:
         print(score.line(name) + f"   (places given; {score.wanted / len(frames[:2]) / min(score.seconds):.0f} targets/s)")
     print()
     stages(frames[0], args.repeats)
+    call_ms, target_us = sequences(frames[0], args.repeats)
     many(rng)
     lines_per_s, line_template, line_rows = lines(rng, args.repeats)
     print()
@@ -263,6 +289,8 @@ def main() -> None:
     verdict("template, whole frame", 1e3 * min(ours["template"].seconds), 60, " ms")
     for name in CENTROIDS:
         verdict(f"{name}, whole frame", 1e3 * min(ours[name].seconds), 15, " ms")
+    verdict("tracking, a call", call_ms, 0.15, " ms")
+    verdict("tracking, a target", target_us, 30, " µs")
     verdict("line template", lines_per_s, 5000, " lines/s", at_least=True)
     verdict("line template over the bound", line_template, 1.05)
     verdict("row-wise squared centroid of lines over the bound", line_rows, 1.2)
