@@ -211,9 +211,8 @@ def sequences(frame: Frame, repeats: int) -> tuple[float, float]:
     plain_s = best_s(lambda: locate(region, estimator="soft_threshold", threads=1), 5 * repeats)
     whole_s = best_s(lambda: all_of_them.update(frame.image), 2 * repeats)
     print(f"tracking, soft_threshold: {1e3 * call_s:.3f} ms a call for 64 × 64 pixels ({len(one)} targets; locate {1e3 * plain_s:.2f} ms)")
-    print(
-        f"tracking, soft_threshold: {1e3 * whole_s:.1f} ms a frame, {1e6 * whole_s / len(all_of_them):.1f} µs a target, {1 / whole_s:.0f} frames/s"
-    )
+    each_us = 1e6 * whole_s / len(all_of_them)
+    print(f"tracking, soft_threshold: {1e3 * whole_s:.1f} ms a frame, {each_us:.1f} µs a target, {1 / whole_s:.0f} frames/s")
     if peers.available("cv2"):
         import cv2
 

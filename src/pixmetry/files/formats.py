@@ -151,13 +151,18 @@ def read_stacked(path: Path, raw: RawLayout | None = None) -> tuple[Decoded, str
     InputError
         If the file is damaged, or has no such frame.
     """
+    found = read_one(path, raw)
+    values = np.ascontiguousarray(found.array, found.array.dtype.newbyteorder("<")).tobytes()
+    return found, hashlib.sha256(values).hexdigest(), len(values)
+
+
+def read_one(path: Path, raw: RawLayout | None = None) -> Decoded:
+    """Read one frame of a file with several; errors as of `read_stacked`."""
     file, index = opened(path.parent, raw), int(path.name)
     if index >= file.count:
         raise InputError("the file has no such frame", where=str(path.parent), value=index, allowed=f"0 to {file.count - 1}")
     with _told_of(path):
-        found = file.read(index)
-    values = np.ascontiguousarray(found.array, found.array.dtype.newbyteorder("<")).tobytes()
-    return found, hashlib.sha256(values).hexdigest(), len(values)
+        return file.read(index)
 
 
 def opened(path: Path, raw: RawLayout | None = None) -> FrameFile:

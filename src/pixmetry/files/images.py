@@ -13,7 +13,7 @@ from pixmetry.camera.observations import Storage
 from pixmetry.core.errors import InputError
 from pixmetry.core.memory import check_memory
 from pixmetry.core.threads import imap_tiles
-from pixmetry.files.formats import ENDINGS, FORMATS, Decoded, decode, frames_of, is_frame, raw_file, read_stacked
+from pixmetry.files.formats import ENDINGS, FORMATS, Decoded, decode, frames_of, is_frame, raw_file, read_one, read_stacked
 from pixmetry.files.jpeg import SIGNATURE as JPEG
 from pixmetry.files.jpeg import luminance_of, luminance_table
 from pixmetry.files.png import SIGNATURE, PlainPng
@@ -122,7 +122,7 @@ def load_picture(path: Path, channel: str | None = None, raw: RawLayout | None =
     if is_entry(path):
         found = Decoded(read_entry(path)[0], lossless_store(path))
     elif is_frame(path) or raw_file(path, raw):
-        found = read_stacked(path if is_frame(path) else path / "0", raw)[0]
+        found = read_one(path if is_frame(path) else path / "0", raw)
     else:
         found = decode(_read_bytes(path), path, lossy=True)
     array = found.array
