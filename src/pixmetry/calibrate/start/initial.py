@@ -147,12 +147,15 @@ def _search_distance(work: Reconstruction, camera: int, images: np.ndarray) -> N
         trial.interior[camera, 0] = c
         trial.look()
         trial.spread_px = np.inf  # anything may be wrong as yet
-        for image in images:
+        for k, image in enumerate(images):
             trial.resect(int(image))
-        trial.judge()
-        cost = trial.cost(images)
-        if cost < least:
-            best, least = trial, cost
+            if trial.least_cost(images[: k + 1], images) > least:  # it cannot become the best any more
+                break
+        else:
+            trial.judge()
+            cost = trial.cost(images)
+            if cost < least:
+                best, least = trial, cost
     if best is None or not best.posed[images].any():
         return
     best.adjust(rounds=3)

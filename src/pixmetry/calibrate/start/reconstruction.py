@@ -145,12 +145,20 @@ class Reconstruction:
 
         Points that no second image sees say nothing.
         """
+        squares = self._squares(images)
+        return float(np.mean(squares)) if len(squares) else (FINE * self.width) ** 2
+
+    def least_cost(self, done: np.ndarray, images: np.ndarray) -> float:
+        """What `cost` of ``images`` is at least, when those ``done`` of them have their poses."""
+        return float(self._squares(done).sum()) / max(1, np.count_nonzero(np.isin(self.network.image, images)))
+
+    def _squares(self, images: np.ndarray) -> Array:
         worst = FINE * self.width
         mine = np.isin(self.network.image, images)
         often = np.bincount(self.network.point[mine & self.posed[self.network.image]], minlength=len(self.xyz)) >= 2
-        rows = mine & (often | self.control)[self.network.point]
-        error = np.hypot(*self.residuals()[rows].T)
-        return float(np.mean(np.minimum(np.where(np.isnan(error), worst, error), worst) ** 2)) if rows.any() else worst**2
+        error = np.hypot(*self.residuals()[mine & (often | self.control)[self.network.point]].T)
+        squares: Array = np.minimum(np.where(np.isnan(error), worst, error), worst) ** 2
+        return squares
 
     def fits(self, images: np.ndarray, share: float) -> bool:
         """Whether the root of `cost` is below a share of FINE."""
