@@ -150,7 +150,7 @@ class Reconstruction:
 
     def least_cost(self, done: np.ndarray, images: np.ndarray) -> float:
         """What `cost` of ``images`` is at least, when those ``done`` of them have their poses."""
-        return float(self._squares(done).sum()) / max(1, np.count_nonzero(np.isin(self.network.image, images)))
+        return float(np.sum(self._squares(done))) / max(1, int(np.isin(self.network.image, images).sum()))
 
     def _squares(self, images: np.ndarray) -> Array:
         worst = FINE * self.width
