@@ -11,6 +11,7 @@ import pytest
 
 from calibrate.networks import simulate
 from pixmetry.calibrate.bundle.solve import Options, calibrate_network
+from pixmetry.calibrate.files.record import _record, _stored
 from pixmetry.calibrate.records import (
     AxisComponent,
     CameraComponents,
@@ -22,7 +23,7 @@ from pixmetry.calibrate.records import (
     record_of,
 )
 from pixmetry.core.errors import InputError
-from pixmetry.files.strict_json import json_text
+from pixmetry.files.strict_json import json_text, plain
 
 
 @pytest.fixture(scope="module")
@@ -83,3 +84,16 @@ def test_without_pandas_one_error_says_what_to_do(calibration, monkeypatch):
         calibration.to_dataframe()
     with pytest.raises(InputError, match="no such table"):
         calibration.columns("distances")
+
+
+def test_covariances_of_points_are_stored_as_lower_triangles_and_those_of_older_files_stay_right(rng):
+    """As the joint covariance is; a file without the name of the form has upper ones: XX, XY, XZ, YY, YZ, ZZ."""
+    simulated = simulate(rng, images=6, points=20)
+    made = calibrate_network(simulated.network, Options(folds=0), simulated.truth)
+    record = json.loads(json_text(plain(_record(made))))
+    expected = made.adjustment.point_covariance
+    np.testing.assert_allclose(_stored(record).point_covariance, expected, rtol=1e-9)
+    np.testing.assert_array_equal(np.array(record["points"]["covariance"], float), expected[:, [0, 1, 1, 2, 2, 2], [0, 0, 1, 0, 1, 2]])
+    del record["points"]["covariance_form"]
+    record["points"]["covariance"] = expected[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]].tolist()
+    np.testing.assert_allclose(_stored(record).point_covariance, expected, rtol=1e-9)

@@ -46,7 +46,7 @@ LEVEL = 0.01  # of the F-tests together
 LEAST_IMAGES = 4  # of a camera whose images have anything in common that can be told from what is each image's own
 LEAST_DOF = 20  # below, residuals tell nothing of this kind
 LEAST_TILT = 0.02  # rms sine of the tilt below which images have one direction of view
-MOST_IMAGES = 80  # whose own displacements make the estimate; of more, these are spread evenly
+MOST_IMAGES = 60  # whose own displacements make the estimate; of more, these are spread evenly
 
 
 class Effect(NamedTuple):
@@ -54,7 +54,7 @@ class Effect(NamedTuple):
 
     kind: str
     camera: int  # -1: of several cameras together
-    columns: Any  # sparse, (2 n, q); rows x, y, x, y, …
+    columns: Any  # (2 n, q), sparse of images, else an ndarray; rows x, y, x, y, …
     mean_square: float  # of the displacement of an image coordinate for θ = 1
 
 
@@ -82,7 +82,7 @@ class System:
         from scipy.linalg.lapack import dpotrs
 
         layout, solved, m = self.layout, self.solved, len(self.layout.columns)
-        right = np.asarray((self.jacobian.T @ columns).todense())
+        right = _dense(self.jacobian.T @ columns)
         by_point = solved.root @ right[m:].reshape(len(layout.point_col), 3, -1)
         scale, ties = solved.scale[:, None], solved.ties
         reduced = right[:m] - self.eliminated @ by_point.reshape(-1, right.shape[1])
@@ -241,7 +241,11 @@ def _effect(layout: Layout, kind: str, camera: int, rows: Ints, basis: Array, gr
     """Displacements along x, then along y, by the functions ``basis`` (rows, b) of each group; whitened."""
     from scipy.sparse import csr_matrix
 
-    b = basis.shape[1]
+    b, mean_square = basis.shape[1], float((basis**2).sum() / max(1, len(rows)))
+    if groups == 1:
+        whole, w = np.zeros((2 * len(layout.x), 2 * b)), layout.whiten[rows]
+        whole[2 * rows, :b], whole[2 * rows + 1, :b], whole[2 * rows + 1, b:] = w[:, :1] * basis, w[:, 1:2] * basis, w[:, 2:] * basis
+        return Effect(kind, camera, whole, mean_square)
     first = 2 * b * group[:, None] + np.arange(b)
     w = layout.whiten[rows]
     parts = ((0, 0, w[:, :1]), (1, 0, w[:, 1:2]), (1, b, w[:, 2:]))
@@ -249,7 +253,7 @@ def _effect(layout: Layout, kind: str, camera: int, rows: Ints, basis: Array, gr
     row = np.concatenate([np.repeat(2 * rows + axis, b) for axis, _, _ in parts])
     column = np.concatenate([(first + shift).ravel() for _, shift, _ in parts])
     columns = csr_matrix((values, (row, column)), shape=(2 * len(layout.x), 2 * b * groups))
-    return Effect(kind, camera, columns, float((basis**2).sum() / max(1, len(rows))))
+    return Effect(kind, camera, columns, mean_square)
 
 
 def _other_images(layout: Layout, took: Flags, effects: Sequence[Effect]) -> Iterator[tuple[int, Effect]]:
@@ -274,8 +278,9 @@ class Estimate(NamedTuple):
     """Variances of the effects: θ₀ first."""
 
     theta: Array  # (k + 1,)
-    covariance: Array  # (k + 1, k + 1)
+    covariance: Array  # (k + 1, k + 1), of normal errors; 0 where nothing was found
     p: Array  # (k,)
+    found: bool  # whether any is significant
 
 
 def estimate_of(effects: Sequence[Effect], left: Array, forms: Array, squares: float, dof: int, *, a_priori: bool = False) -> Estimate:
@@ -316,7 +321,9 @@ def estimate_of(effects: Sequence[Effect], left: Array, forms: Array, squares: f
         theta[1:] = nnls(T[1:, 1:] / size[1:, None], (y - T[:, 0])[1:] / size[1:])[0]
     else:
         theta = nnls(T / size[:, None], y / size)[0]
-    return Estimate(theta, _scatter(theta, T, left, parts, dof, a_priori), np.nan_to_num(p, nan=1.0))
+    p = np.nan_to_num(p, nan=1.0)
+    found = bool(p.min(initial=1.0) * k < LEVEL and theta[1:].any())
+    return Estimate(theta, _scatter(theta, T, left, parts, dof, a_priori) if found else np.zeros_like(T), p, found)
 
 
 def _scatter(theta: Array, T: Array, left: Array, parts: Sequence[slice], dof: int, a_priori: bool) -> Array:
@@ -360,18 +367,20 @@ def with_shared_errors(adjustment: Adjustment, *, a_priori: bool = False) -> Adj
         return adjustment
     layout, now, took = system.layout, system.now, system.now.weight > 0
     effects = effects_of(layout, took, view_of(adjustment))
-    columns = _side_by_side(effects)
-    right, step, points = system.answers(columns)
-    m = len(layout.columns)
-    left = _dense(columns.T @ columns) - right[:m].T @ step - right[m:].T @ points.reshape(-1, right.shape[1])
-    forms = columns.T @ np.where(took[:, None], now.residual, 0.0).ravel()
+    m, residual = len(layout.columns), np.where(took[:, None], now.residual, 0.0).ravel()
+    answers = [system.answers(effect.columns) for effect in effects]
+    right, step = (np.concatenate([answer[k] for answer in answers], axis=1) for k in (0, 1))
+    points = np.concatenate([answer[2] for answer in answers], axis=2)
+    full = np.block([[_product(one.columns, other.columns) for other in effects] for one in effects])
+    left = full - right[:m].T @ step - right[m:].T @ points.reshape(-1, right.shape[1])
+    forms = np.concatenate([effect.columns.T @ residual for effect in effects])
     found = estimate_of(effects, left, forms, now.cost, adjustment.dof, a_priori=a_priori)
     kinds = tuple((effect.kind, effect.camera) for effect in effects)
     rms = np.sqrt(found.theta[1:] * [effect.mean_square for effect in effects])
     variances = np.diag(adjustment.covariance)
     u, dof = np.sqrt(np.maximum(variances, 0.0)), np.full(len(variances), float(adjustment.dof))
     shared = SharedErrors(kinds, rms, found.p, found.theta[1:], 1.0, u, dof, False)
-    if not (found.p.min() * len(effects) < LEVEL and found.theta[1:].any()):
+    if not found.found:
         return replace(adjustment, shared=replace(shared, rms_px=0.0 * rms, variance_px2=0.0 * found.theta[1:]))
     return _widened(adjustment, system, effects, found, (step, points), shared, a_priori)
 
@@ -471,12 +480,15 @@ def shared_moves(adjustment: Adjustment, points: Ints) -> tuple[Array, Array]:
     return np.hstack([one for one, _ in found]), np.hstack([one for _, one in found])
 
 
-def _side_by_side(effects: Sequence[Effect]) -> Any:
-    from scipy.sparse import hstack
+def _product(one: Any, other: Any) -> Array:
+    """Fᵀ G of columns that are sparse or not."""
+    from scipy.sparse import issparse
 
-    return hstack([effect.columns for effect in effects]).tocsr()
+    if issparse(other) and not issparse(one):
+        return np.asarray(_dense(other.T @ one).T)
+    return _dense(one.T @ other)
 
 
 def _dense(matrix: Any) -> Array:
-    dense: Array = np.asarray(matrix.todense())
+    dense: Array = matrix if isinstance(matrix, np.ndarray) else matrix.toarray()
     return dense

@@ -98,6 +98,8 @@ def field_sources(
     y: np.ndarray,
     image: np.ndarray,
     chosen: Mapping[str, tuple[Candidate, Place]],
+    *,
+    left: bool = False,
 ) -> FieldSources:
     """What the residuals of one camera tell of its error sources.
 
@@ -113,6 +115,8 @@ def field_sources(
     image : ndarray of int, shape (n,)
     chosen : mapping
         Patterns that explain the residuals, with their terms: those of other sources are estimated along.
+    left : bool
+        Whether residuals depend on the place in the frame beyond these: then no height is named as what explains them.
 
     Returns
     -------
@@ -122,7 +126,7 @@ def field_sources(
     beside = {name: candidate for name, (candidate, _) in chosen.items()}
     place = {name: place for name, (_, place) in chosen.items()}
     return FieldSources(
-        height=_height(camera, _others(beside, "unflatness", "radius"), place.get("unflatness")),
+        height=_height(camera, _others(beside, "unflatness", "radius"), place.get("unflatness"), left=left),
         seams=_seams(camera, _others(beside, "seams", "field"), place.get("seams")),
         scales=_scales(camera, _others(beside, "x_scale_trend", "x_scale_by_image")),
     )
@@ -136,14 +140,14 @@ def _others(chosen: Mapping[str, Candidate], *own: str) -> list[Candidate]:
 # ---- height ---------------------------------------------------------------------------------------------------------------------------
 
 
-def _height(camera: _Camera, others: list[Candidate], place: Place | None) -> HeightMap | None:
+def _height(camera: _Camera, others: list[Candidate], place: Place | None, *, left: bool) -> HeightMap | None:
     """The height by the few plain shapes, or by all of the fourth degree where these explain more."""
     few, more = (_height_of(camera, others, degrees) for degrees in (PLAIN, DEGREES))
     if few is None or more is None:
         return few
     found = more if more.gain > few.gain + STRONG else few
     enough = len(np.unique(camera.image)) >= LEAST_TOLD
-    named = bool(enough and place is not None and not place.rivals and found.gain > STRONG and found.p_turned > TURNED)
+    named = bool(enough and not left and place is not None and not place.rivals and found.gain > STRONG and found.p_turned > TURNED)
     return replace(found, found=named, rivals=place.rivals if place is not None else ())
 
 

@@ -180,7 +180,9 @@ def searched_residuals(adjustment: Adjustment, level: float = 0.01) -> Searched:
         places = places_of(terms, shown)
         by_name = {candidate.name: candidate for candidate in shown}
         chosen = {name: (by_name[name], place) for name, place in places.items() if not place.behind}
-        told = sources[camera.name] = field_sources(terms, one.camera, one.mine, one.x, one.y, one.image, chosen)
+        rest = places.get("field")
+        left = rest is not None and (not rest.behind or rest.p_left < level / count)
+        told = sources[camera.name] = field_sources(terms, one.camera, one.mine, one.x, one.y, one.image, chosen, left=left)
         patterns += [replace(_worded(p, places, camera.interface), confirmed=p.name in told.confirmed) for p in judged]
     return Searched(tuple(patterns), sources)
 
@@ -242,9 +244,10 @@ def searched_without_bad_images(adjustment: Adjustment, adjust: Callable[..., Ad
     return replace(again, patterns=patterns)
 
 
-def _of_a_clock(one: Pattern) -> bool:
-    """Whether a scale of x may be a grabber's: not of one image alone, of a digital camera, or beside a shear of the images as large."""
-    return not one.alone and one.source.startswith("grabber.") and (one.p_alike is None or one.p_alike < RARE_ALIKE)
+def _along_rows_only(one: Pattern) -> bool:
+    """Whether a scale of x is what changes in the images, as a clock or a resampling makes it: not of one image alone, or beside a shear of
+    the images as large."""
+    return not one.alone and (one.p_alike is None or one.p_alike < RARE_ALIKE)
 
 
 def pattern_findings(patterns: Sequence[Pattern]) -> tuple[Finding, ...]:
@@ -257,7 +260,7 @@ def pattern_findings(patterns: Sequence[Pattern]) -> tuple[Finding, ...]:
         if one.outstanding:
             out.append(_bad_images(one.outstanding, where))
             continue
-        kind = "x_scale_drift" if one.name in DRIFT and _of_a_clock(one) else one.name
+        kind = "x_scale_drift" if one.name in DRIFT and _along_rows_only(one) else one.name
         if one.behind and not (kind == "x_scale_drift" and one.behind in DRIFT):
             continue
         caused = f" ({words})" if (words := cause_words(one)) else ""

@@ -25,6 +25,7 @@ from pixmetry.files.strict_json import json_text, plain
 RESULT_SCHEMA = "pixmetry/calibration-result/1"
 LINES_SCHEMA = "pixmetry/line-calibration-result/1"
 PIXELS = "pixel (0, 0) is the centre of the top-left pixel, x to the right, y down"
+LOWER = "lower triangle by rows: XX, YX, YY, ZX, ZY, ZZ"
 T = TypeVar("T")
 
 
@@ -127,7 +128,8 @@ def _record(calibration: Calibration) -> dict[str, Any]:
         "points": {
             "name": network.points,
             "xyz": state.xyz,
-            "covariance": a.point_covariance.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]],  # XX, XY, XZ, YY, YZ, ZZ
+            "covariance": a.point_covariance.reshape(-1, 9)[:, [0, 3, 4, 6, 7, 8]],
+            "covariance_form": LOWER,
         },
         "control_points": _control_record(calibration),
         "covariance": {"columns": a.free_columns, **packed(a.covariance)},
@@ -285,6 +287,7 @@ def _read(path: str | Path, schemas: tuple[str, ...], made: Callable[[Mapping[st
 def _stored(record: Mapping[str, Any]) -> StoredCalibration:
     images, points = record["images"], record["points"]
     xyz, six = _array(points["xyz"], 3), _array(points["covariance"], 6)
+    whole = [0, 1, 3, 1, 2, 4, 3, 4, 5] if "covariance_form" in points else [0, 1, 2, 1, 3, 4, 2, 4, 5]  # older files: the upper triangle
     return StoredCalibration(
         cameras=tuple(_camera(camera) for camera in record["cameras"]),
         columns=tuple(record["covariance"]["columns"]),
@@ -295,7 +298,7 @@ def _stored(record: Mapping[str, Any]) -> StoredCalibration:
         position=_array(images["position"], 3),
         points=tuple(points["name"]),
         xyz=xyz,
-        point_covariance=six[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3),
+        point_covariance=six[:, whole].reshape(-1, 3, 3),
         findings=tuple(Finding.from_record(finding) for finding in record["findings"]),
         tests=read_record(Tests, record["tests"]),
         grids={name: read_record(ResidualGrid, grid) for name, grid in record["grids"].items()},
