@@ -209,6 +209,19 @@ def test_plate_without_a_mark_is_followed_by_the_smallest_rotation(rng: np.rando
     assert calm.findings[0].level == "note"
 
 
+def test_an_asymmetric_grid_of_an_odd_number_of_rows_is_numbered_however_it_is_turned(rng: np.random.Generator) -> None:
+    """4 × 7 dots as OpenCV counts them, (2 col + row % 2, row) half steps, rolled by 0, 100, 190, 275 degrees; a column more is refused."""
+    gone = {(c, r): -1.0 for c in range(8) for r in range(7) if (c + r) % 2}
+    views = of_board(8, 7, 14.0, (0.0, 100.0, 190.0, 275.0))
+    frames = [view.frame(dots(8, 7, 0.3, gone), rng) for view in views]
+    seen = observations_of(frames, "asymmetric", grid="4x7", pitch=2.0)
+    assert len(seen) == 4 * 28 and not [f for f in seen.findings if f.kind == "numbering"]
+    assert np.abs(differences(seen, views)).max() < 0.2  # with 0.1 px of eccentricity
+    assert tuple(seen.xyz[seen.points.index("1/3")]) == (7.0, 1.0, 0.0)
+    with pytest.raises(MeasureError, match="dots were seen"):
+        observations_of(frames[:1], "asymmetric", grid="3x7", pitch=2.0, least_images=1)
+
+
 def test_corners_of_squares_cover_their_truth(rng: np.random.Generator) -> None:
     """The mean of dᵀ C⁻¹ d / 2 over 432 corners, of which two share a side, is 1 ± 0.07: 5 standard deviations are 0.66 … 1.34,
     which catches a wrong factor of 1.2 in standard deviations; the largest error is 8 standard uncertainties of 0.03 px at most."""

@@ -71,11 +71,11 @@ def calibrate(
     progress : callable, optional
         Called with (what, done, of).
     **pictures
-        For pictures: ``kind`` ("chessboard", "dots", "coded", "squares", "charuco", "aprilgrid" or "lines"), ``grid`` ("9x6"),
-        ``pitch_mm`` (spacing of the targets), ``side_mm``, ``diameter_mm`` (of squares, markers and dots), ``dictionary`` (of
-        markers), ``polarity``, ``channel``, ``raw`` ("1920x1200:Mono12p", of files without a header), ``noise``; and of the camera:
-        ``camera`` (a preset or camera file, which brings the pitch), ``interface`` ("digital" or "analogue": whether a frame
-        grabber samples its lines), ``direction``, ``projection``, ``pixel_um`` (pitch of the pixels), ``c_mm`` or ``c_px``;
+        For pictures: ``kind`` ("chessboard", "dots", "asymmetric", "coded", "squares", "charuco", "aprilgrid" or "lines"), ``grid``
+        ("9x6"), ``pitch_mm`` (spacing of the targets), ``side_mm``, ``diameter_mm`` (of squares, markers and dots), ``dictionary``
+        (of markers), ``polarity``, ``channel``, ``raw`` ("1920x1200:Mono12p", of files without a header), ``noise``; and of the
+        camera: ``camera`` (a preset or camera file, which brings the pitch), ``interface`` ("digital" or "analogue": whether a
+        frame grabber samples its lines), ``direction``, ``projection``, ``pixel_um`` (pitch of the pixels), ``c_mm`` or ``c_px``;
         ``rig=True``: the names tell several cameras that stand still against each other, and their instants (left01, right01).
 
     Returns

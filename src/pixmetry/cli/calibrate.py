@@ -11,7 +11,7 @@ from pixmetry.cli._console import echo, echo_lines
 from pixmetry.cli._json import JsonResult, json_option
 from pixmetry.cli._pdf import check_pdf, pdf_option, put_pdf
 
-KINDS = ("chessboard", "dots", "coded", "squares", "charuco", "aprilgrid", "lines")
+KINDS = ("chessboard", "dots", "asymmetric", "coded", "squares", "charuco", "aprilgrid", "lines")
 if TYPE_CHECKING:
     from pixmetry.report import Page
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from pixmetry.calibrate.bundle.model import CameraModel
 from pixmetry.calibrate.bundle.network import Network
-from pixmetry.calibrate.images.numbering import consistent
+from pixmetry.calibrate.images.numbering import asymmetric_turns, consistent
 from pixmetry.calibrate.images.targets import DICTIONARIES, KINDS, NUMBERED, Seen, Wanted, board_size, see
 from pixmetry.camera.camera import Camera
 from pixmetry.core.errors import InputError, MeasureError
@@ -119,9 +119,10 @@ def observations_of(
     images : sequence of path or ndarray
         Image files (PNG, TIFF, BMP, FITS, NPY, JPEG, raw), folders of them, or frames of shape (rows, cols), in the order in which they
         were taken. A file with several frames is as many images.
-    kind : {"chessboard", "dots", "squares", "coded", "charuco", "aprilgrid"}
-        Inner corners of a chessboard; a plate of circular targets; corners of a plate of separate squares; coded targets anywhere; inner
-        corners of a chessboard whose bright squares hold markers; corners of a grid of AprilTags.
+    kind : {"chessboard", "dots", "asymmetric", "squares", "coded", "charuco", "aprilgrid"}
+        Inner corners of a chessboard; a plate of circular targets; one whose odd rows are shifted by half a step (OpenCV's); corners of a
+        plate of separate squares; coded targets anywhere; inner corners of a chessboard whose bright squares hold markers; corners of a
+        grid of AprilTags.
     grid : "COLSxROWS" or (cols, rows), optional
         Of inner corners, dots, separate squares or tags on the whole board; of a charuco board the squares. "any" numbers the dots of a
         single image that may show a part of the plate. Not for coded targets.
@@ -186,8 +187,8 @@ def observations_of(
         out,
         points=names,
         xyz=xyz,
-        diameter=None if diameter is None or kind not in ("dots", "coded") else np.full(len(names), float(diameter)),
-        normal=np.tile([0.0, 0.0, 1.0], (len(names), 1)) if kind == "dots" else None,
+        diameter=None if diameter is None or kind not in ("dots", "asymmetric", "coded") else np.full(len(names), float(diameter)),
+        normal=np.tile([0.0, 0.0, 1.0], (len(names), 1)) if kind in ("dots", "asymmetric") else None,
         left_out=tuple((s.name, s.reason) for s in seen if s.reason),
         findings=(*_lost_images(seen), *numbering, *_notes(good), *out.findings),
     )
@@ -273,7 +274,8 @@ def _numbered(good: list[Seen], kind: str) -> tuple[list[Seen], tuple[Finding, .
     if kind in NUMBERED:
         return good, ()
     rows, cols = good[0].extent
-    boards, findings = consistent([s.board for s in good], chessboard_turns(rows, cols) if kind == "chessboard" else None)
+    alike = {"chessboard": lambda: chessboard_turns(rows, cols), "asymmetric": lambda: asymmetric_turns(rows)}.get(kind, lambda: None)()
+    boards, findings = consistent([s.board for s in good], alike)
     return [replace(s, keys=np.column_stack([b.row, b.col])) for s, b in zip(good, boards, strict=True)], findings
 
 
@@ -299,6 +301,9 @@ def _nominal(keys: np.ndarray, kind: str, pitch: tuple[float, float], side: floa
     if kind == "coded":
         return tuple(str(k) for k in keys[:, 0]), np.full((len(keys), 3), np.nan)
     row, col = keys.T
+    if kind == "asymmetric":
+        names = tuple(f"{r}/{c // 2}" for r, c in keys)
+        return names, np.column_stack([0.5 * col * pitch[0], 0.5 * row * pitch[1], np.zeros(len(keys))])
     if kind not in ("squares", "aprilgrid"):
         return tuple(f"{r}/{c}" for r, c in keys), np.column_stack([col * pitch[0], row * pitch[1], np.zeros(len(keys))])
     corner = np.where(row % 2 == 0, col % 2, 3 - col % 2)

@@ -63,6 +63,11 @@ def column_angle_deg(board: Board) -> float:
     return float(np.degrees(np.arctan2(step[1], step[0])))
 
 
+def asymmetric_turns(rows: int) -> tuple[int, ...]:
+    """Quarters of a turn after which a grid whose odd rows are shifted by half a step looks the same: 2, of an even number of rows."""
+    return (0,) if rows % 2 else (0, 2)
+
+
 def dot_marks(board: Board, area_px: np.ndarray) -> Marks:
     """Dots that are larger (1) or smaller (−1) than those around them."""
     from scipy.spatial import cKDTree

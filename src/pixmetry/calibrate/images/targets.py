@@ -20,7 +20,7 @@ from pixmetry.locate.job import locate
 from pixmetry.locate.noise import ROUNDING_DN2, NoiseModel
 from pixmetry.locate.records import Located
 
-KINDS = ("chessboard", "dots", "squares", "coded", "charuco", "aprilgrid")
+KINDS = ("chessboard", "dots", "asymmetric", "squares", "coded", "charuco", "aprilgrid")
 NUMBERED = ("coded", "charuco", "aprilgrid")  # whose targets carry numbers: part of a board suffices
 DICTIONARIES = {"charuco": "5X5_1000", "aprilgrid": "APRILTAG_36h11"}  # of markers, unless another one is named
 LEAST_SHARE = 0.5  # of a board's points, that an image must show to be used
@@ -36,7 +36,7 @@ class Wanted:
 
     Parameters
     ----------
-    kind : {"chessboard", "dots", "squares", "coded", "charuco", "aprilgrid"}
+    kind : {"chessboard", "dots", "asymmetric", "squares", "coded", "charuco", "aprilgrid"}
     grid : (int, int) or None
         Columns and rows of the whole board; None: not known, or there is none.
     side : (float, float)
@@ -173,6 +173,22 @@ def _dots(name: str, frame: np.ndarray, wanted: Wanted) -> Seen:
     return replace(seen, marks=dot_marks(seen.board, area))
 
 
+def _asymmetric(name: str, frame: np.ndarray, wanted: Wanted) -> Seen:
+    from pixmetry.locate.detect.grids import RIM_SHARE, order_grid
+
+    assert wanted.grid is not None
+    cols, rows = wanted.grid
+    found = _located(name, frame, "disc", wanted)
+    grid = order_grid(found.x_px, found.y_px, pattern=wanted.grid, asymmetric=True)
+    if grid.message:
+        return _nothing(name, frame, f"{len(found)} dots were seen: {grid.message}")
+    keys = np.column_stack([grid.row, np.where(grid.placed, 2 * grid.col + grid.row % 2, -1)])
+    in_row, in_col = (np.bincount(key[grid.placed], minlength=n) for key, n in zip(keys.T, (rows, 2 * cols), strict=True))
+    if in_row[[0, -1]].min() < RIM_SHARE * cols or in_col[[0, -1]].min() < RIM_SHARE * (rows // 2):
+        return _nothing(name, frame, f"{len(found)} dots were seen: an outermost row or column of {cols} × {rows} is hardly there")
+    return _seen(name, frame, found, keys, grid.placed & _usable(found), (rows, 2 * cols))
+
+
 def _squares(name: str, frame: np.ndarray, wanted: Wanted) -> Seen:
     from pixmetry.locate.detect.squares import plate_corners
 
@@ -253,7 +269,15 @@ def _noise_of(frame: np.ndarray, wanted: Wanted) -> NoiseModel:
     return NoiseModel(max(sigma**2, ROUNDING_DN2 if frame.dtype.kind == "u" else 1e-12), low_dn=low, high_dn=high, origin="image")
 
 
-_FINDERS = {"chessboard": _chessboard, "dots": _dots, "squares": _squares, "coded": _coded, "charuco": _charuco, "aprilgrid": _aprilgrid}
+_FINDERS = {
+    "chessboard": _chessboard,
+    "dots": _dots,
+    "asymmetric": _asymmetric,
+    "squares": _squares,
+    "coded": _coded,
+    "charuco": _charuco,
+    "aprilgrid": _aprilgrid,
+}
 
 
 def board_size(kind: str, grid: str | tuple[int, int] | None) -> tuple[int, int] | None:

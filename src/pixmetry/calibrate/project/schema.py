@@ -154,7 +154,7 @@ class PicturesModel(Model):
     """Images in which targets are located; of several cameras the files of each, by its name."""
 
     files: Annotated[Files | dict[Name, Files], Field(min_length=1)]
-    kind: Literal["chessboard", "dots", "coded", "squares", "charuco", "aprilgrid", "lines"] = "chessboard"
+    kind: Literal["chessboard", "dots", "asymmetric", "coded", "squares", "charuco", "aprilgrid", "lines"] = "chessboard"
     grid: str | None = None
     pitch: Positive | tuple[Positive, Positive] | None = None
     side: Positive | None = None
