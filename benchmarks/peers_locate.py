@@ -1,4 +1,4 @@
-"""Other programs that locate discs, each with settings that suit it, for bench_locate.py.
+"""Other programs that locate discs, each with settings that suit it, for bench_locate.py and bench_found.py.
 
 Every function takes a uint8 frame with bright targets (or dark ones, with ``dark``) and returns x, y of what it found, in its own origin.
 They all put (0, 0) at the centre of the top-left pixel on these frames; the benchmark measures and prints each one's mean offset.
@@ -162,6 +162,31 @@ def _photutils(frame: np.ndarray, dark: bool, x: np.ndarray, y: np.ndarray, func
     image = _bright(frame, dark).astype(float)
     image -= np.median(image[::8, ::8])
     return centroid_sources(image, np.rint(x), np.rint(y), box_size=21, centroid_func=function)
+
+
+def invert_dark(frame: np.ndarray, dark: bool) -> np.ndarray:
+    """The frame with bright targets."""
+    return _bright(frame, dark)
+
+
+def sep_found(frame: np.ndarray, sigmas: float) -> Found:
+    """sep: background and extract at a threshold, for bench_found.py."""
+    import sep
+
+    image = frame.astype(np.float32)
+    back = sep.Background(image, bw=64, bh=64)
+    back.subfrom(image)
+    found = sep.extract(image, sigmas, err=back.globalrms)
+    return found["x"], found["y"]
+
+
+def trackpy_found(frame: np.ndarray, diameter_px: float, count: int) -> Found:
+    """trackpy: the places of greatest mass, as many as there are targets, for bench_found.py."""
+    import trackpy
+
+    trackpy.quiet()
+    table = trackpy.locate(frame, 2 * int(diameter_px / 2) + 3, topn=count, characterize=False)
+    return table["x"].to_numpy(), table["y"].to_numpy()
 
 
 WHOLE: dict[str, tuple[str, Callable[[np.ndarray, bool], Found]]] = {

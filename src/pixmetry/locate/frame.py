@@ -8,7 +8,7 @@ from pixmetry.core.errors import InputError
 from pixmetry.locate.noise import NoiseModel
 
 MOSAIC_LEAST, MOSAIC_SIGMA = 0.02, 6.0  # difference of the two diagonals of 2 × 2 pixels: of the level, and of its standard error
-MOSAIC_CELLS = 100_000  # of 2 × 2 pixels that are looked at
+MOSAIC_CELLS = 8_000  # of 2 × 2 pixels that are looked at
 NEAR_END = 0.01  # of a float image's range: values that lie so near to its end
 PILED = 10  # pixels in 4 of one value at the end of an image before it is asked whether they were cut off there
 

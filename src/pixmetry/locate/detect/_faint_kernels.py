@@ -18,10 +18,22 @@ PEAK = 4  # numbers of a peak: x, y, score, side of the bin
 
 
 @jit
-def add_row(row: np.ndarray, low: Singles, high: Singles, total: Singles) -> None:
-    """Add the pixels of a row, those beyond a limit as this."""
-    for c in range(len(row)):
-        total[c] += min(max(np.float32(row[c]), low[c]), high[c])
+def add_rows(
+    upper: np.ndarray,
+    lower: np.ndarray,
+    level: Singles,
+    level_step: Singles,
+    reach: Singles,
+    reach_step: Singles,
+    f: np.float32,
+    total: Singles,
+    most: Singles,
+) -> None:
+    """Write the sum of two rows' heights over the level, each at most the reach, and the reach."""
+    for c in range(len(upper)):
+        middle, far = level[c] + f * level_step[c], reach[c] + f * reach_step[c]
+        total[c] = min(max(np.float32(upper[c]) - middle, -far), far) + min(max(np.float32(lower[c]) - middle, -far), far)
+        most[c] = far
 
 
 @jit
@@ -33,27 +45,20 @@ def bin_heights(frame: np.ndarray, level: Map, reach: Map, first: int, stop: int
     columns, tiles = frame.shape[1], level.nodes.shape[0]
     levels, level_steps = np.empty(columns, np.float32), np.empty(columns, np.float32)
     reaches, reach_steps = np.empty(columns, np.float32), np.empty(columns, np.float32)
-    middle, most = np.empty(columns, np.float32), np.empty(columns, np.float32)
-    low, high, total = np.empty(columns, np.float32), np.empty(columns, np.float32), np.empty(columns, np.float32)
-    scale, last, two = np.float32(0.5 * sigmas), -1, np.float32(2.0)
+    total, most = np.empty(columns, np.float32), np.empty(columns, np.float32)
+    scale, last = np.float32(sigmas), -1
     for b in range(first, stop):
         v = (2 * b + 1.0) * level.row_scale - 0.5
         i = min(max(int(math.floor(v)), 0), max(tiles - 2, 0))
-        f = np.float32(v - i if tiles > 1 else 0.0)
         if i != last:
             at_columns(level.nodes, i, level.col_scale, levels, level_steps)
             at_columns(reach.nodes, i, reach.col_scale, reaches, reach_steps)
             last = i
-        for c in range(columns):
-            middle[c] = levels[c] + f * level_steps[c]
-            most[c] = reaches[c] + f * reach_steps[c]
-            low[c], high[c] = middle[c] - most[c], middle[c] + most[c]
-            total[c] = np.float32(-2.0) * middle[c]
-        add_row(frame[2 * b], low, high, total)
-        add_row(frame[2 * b + 1], low, high, total)
+        f = np.float32(v - i if tiles > 1 else 0.0)
+        add_rows(frame[2 * b], frame[2 * b + 1], levels, level_steps, reaches, reach_steps, f, total, most)
         row = out[b]
         for c in range(len(row)):
-            row[c] = scale * two * (total[2 * c] + total[2 * c + 1]) / (most[2 * c] + most[2 * c + 1])
+            row[c] = scale * (total[2 * c] + total[2 * c + 1]) / (most[2 * c] + most[2 * c + 1])
 
 
 @jit

@@ -12,7 +12,7 @@ EVENTFUL = 0.2  # least share of blocks that are not even, for these to be the c
 CALM = 0.4  # quantile of their heights that is the height of one pattern of the coder
 PATTERNS = 5.0  # that add up in a block, at most
 LEAST_HEIGHT_DN = 2.5  # of what a coder draws where most blocks are even: their means are rounded to a DN or two
-PARTS = 24  # of the frame that are looked at
+PARTS = 16  # of the frame that are looked at
 
 
 def block_origin(frame: np.ndarray) -> tuple[int, int] | None:
@@ -32,7 +32,8 @@ def block_origin(frame: np.ndarray) -> tuple[int, int] | None:
     if frame.dtype != np.uint8 or min(rows, cols) < 6 * BLOCK:
         return None
     origin = []
-    for rolled in (frame, frame.T):
+    few = np.unique(np.linspace(0, rows - 1, min(PARTS * BLOCK, rows)).astype(int))
+    for rolled in (frame, frame[few].T):
         count = (rolled.shape[0] - 1) // BLOCK
         first = np.unique(np.linspace(0, count - 1, min(PARTS, count)).astype(int)) * BLOCK
         pairs = (first[:, None] + np.arange(BLOCK)).ravel()
