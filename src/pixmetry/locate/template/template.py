@@ -36,6 +36,7 @@ PIECES = 8  # of the work
 FAR_OUT = 25.0  # times the usual
 POOR_SIGMA = 5.5
 FAINT_SHARE = 0.15  # of the blur: uncertainty from which the covariance of first order is too small
+SHARP_SPOT_PX = 0.6  # blur of a spot below which its place depends on what a point's image is, which pixels do not resolve
 SHARP_PX = 0.3  # blur below which a template's position begins to depend on the exact shape of the pixel
 
 
@@ -327,11 +328,16 @@ def _positions(kind: str, targets: Targets, result: Fitted, noise: NoiseModel, m
         (Flag.UNEVEN_BACKGROUND, on_ground),
         (Flag.POOR_FIT, poor),
         (Flag.DEFECT, lone),
-        (Flag.UNDER_SAMPLED, more["blur_px"] < SHARP_PX),
+        (Flag.UNDER_SAMPLED, more["blur_px"] < (SHARP_SPOT_PX if kind == "spot" else SHARP_PX)),
         (Flag.FAINT, worst > FAINT_SHARE * np.hypot(more["blur_px"], 0.29)),
     ):
         flags[where] |= np.uint32(flag)
     var_x, cov_xy, var_y = (result.covariance * wider[:, None]).T.copy()
+    if kind == "spot" and (more["blur_px"] < SHARP_SPOT_PX).any():
+        from pixmetry.locate.template.spot_shape import shape_error_px
+
+        shape = shape_error_px(more["blur_px"])
+        var_x, var_y = var_x + shape**2, var_y + shape**2
     return Positions(p[:, 0].copy(), p[:, 1].copy(), var_x, cov_xy, var_y, flags, more)
 
 
