@@ -35,12 +35,17 @@ def _table() -> tuple[np.ndarray, np.ndarray]:
     from scipy.optimize import least_squares
     from scipy.special import j1
 
-    from pixmetry.locate.template.template import model
+    from pixmetry.locate.template._contour_template_kernels import SPOT
+    from pixmetry.locate.template._template_kernels import mean_images
 
     side = 2 * HALF_PX + 1
     fine = (np.arange(SAMPLES) + 0.5) / SAMPLES - 0.5
     pixel = np.arange(side)[:, None] + fine
     phases = (np.arange(PHASES) + 0.5) / PHASES - 0.5
+
+    def drawn(p: np.ndarray) -> np.ndarray:
+        return mean_images(SPOT, np.concatenate([p, np.zeros(4)]), side, side, 1.0, False)[: len(p) + 1, :, :side]
+
     rows = []
     for zero in FIRST_ZEROS_PX:
         blurs, errors = [], []
@@ -51,11 +56,10 @@ def _table() -> tuple[np.ndarray, np.ndarray]:
                 image = ((2 * j1(rho) / rho) ** 2).mean(axis=(1, 3))
 
                 def left(p: np.ndarray, image: np.ndarray = image) -> np.ndarray:
-                    return (model("spot", p, side, side)[0] - image).ravel()
+                    return (drawn(p)[0] - image).ravel()
 
                 def slopes(p: np.ndarray) -> np.ndarray:
-                    jacobian = model("spot", p, side, side)[1]
-                    return jacobian.reshape(len(jacobian), -1).T
+                    return drawn(p)[1:].reshape(len(p), -1).T
 
                 start = [HALF_PX + x, HALF_PX + y, max(0.34 * zero, 0.2), 1.0, 0.0]
                 fit = least_squares(left, start, slopes, bounds=([0, 0, 0.1, 0, -1], [side, side, 2, 50, 1])).x
