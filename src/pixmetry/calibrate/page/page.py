@@ -363,7 +363,7 @@ def _space(section: Section, calibration: Calibration) -> None:
 def _rig(section: Section, rig: RigRecord) -> None:
     """Relative poses of cameras that stand still against each other, whether they did, and epipolar distances."""
     heads = ["Camera", "against", f"Baseline / {rig.unit}", *(f"{axis} / {rig.unit}" for axis in "XYZ"), "Angle / °"]
-    heads += ["ω / °", "φ / °", "κ / °"]
+    heads += ["About x / °", "About y / °", "About z / °"]
     section.add(number_table("Relative poses", heads, tables.relative_poses(rig), words=2))
     words = (
         "Projection centre in the frame of the other camera (x right, y down, z forwards), and the rotation vector of R: a point X of that "

@@ -320,7 +320,7 @@ def relative_poses(rig: RigRecord) -> list[list[str]]:
 def epipolar(rig: RigRecord) -> list[list[str]]:
     """Pairs of cameras with the rms distance of their image points from epipolar lines."""
     return [
-        [f"{one.first} and {one.second}", str(one.n), value(one.rms_px), _two_digits(one.u_rms_px), value(one.expected_px)]
+        [f"{one.first} and {one.second}", str(one.n), value(one.rms_px), value(one.u_rms_px, 2), value(one.expected_px)]
         for one in rig.epipolar
     ]
 
