@@ -14,9 +14,11 @@ import argparse
 import pickle
 import time
 from collections import Counter, defaultdict
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
@@ -24,6 +26,7 @@ from pixmetry import Frames, campaign_of_arrays
 from pixmetry.assess.job import measure_sources, observe_campaign
 from pixmetry.camera.camera import Camera, Element, in_order
 from pixmetry.camera.catalogue import get_source, sources
+from pixmetry.camera.dark_rows import octave_periods
 from pixmetry.camera.group_facts import GroupFacts
 from pixmetry.camera.light import Scene
 from pixmetry.core.number import Estimates
@@ -33,6 +36,7 @@ from pixmetry.scene.outlines import Outline, disc, polygon
 from pixmetry.scene.picture import Picture
 from pixmetry.scene.shapes import Shapes
 from pixmetry.scene.uniform import Uniform
+from pixmetry.sources.electronics.flicker_noise import FlickerNoise
 
 Values = dict[str, dict[str, object]]
 KINDS = ("rolling CMOS", "global CMOS", "interline CCD", "frame transfer CCD", "analogue")
@@ -43,6 +47,7 @@ UNCOMPARED = ("sensor.defects", "sensor.full_well")  # shares above a threshold;
 DENSITIES = tuple(np.linspace(0.05, 1.85, 16))
 CELL, SIDE = 172, 126
 LENS = ("optics.point_spread", "optics.olpf")
+NO_SETTINGS: Mapping[str, str | int] = MappingProxyType({})
 
 
 @dataclass(frozen=True)
@@ -151,6 +156,7 @@ def draw_unit(kind: str, number: int, seed: int) -> Unit:
     efficiency = values["sensor.quantum_efficiency"]["quantum_efficiency"]
     told = {**known, "pitch_um": 5.0, "temperature_c": TEMPERATURE_C, "lossless": True} | ({"covered": borders} if borders else {})
     told |= {"pixel_clock_mhz": CLOCK_MHZ} if analogue else {}
+    told |= {"sampling_clock_mhz": 10.0} if "grabber.sampling_clock" in values else {}
     return Unit(kind, camera, values, well / efficiency, borders, told, 1000 * seed + number)  # type: ignore[operator]
 
 
@@ -281,7 +287,7 @@ class Scores:
                     self.reasons[name][unmeasured.get(name, "no reason")] += 1
                 continue
             for e in estimates[name]:
-                key, truth = f"{name}.{e.name}", truth_of(unit, name, e.name)
+                key, truth = f"{name}.{e.name}", truth_of(unit, name, e.name, estimates[name].settings)
                 if name not in unit.values:
                     if not e.is_limit and e.u and abs(e.value - (truth or 0.0)) > ABSENT * e.u:
                         self.absent[key].append((e.value, e.u, number))
@@ -296,17 +302,20 @@ class Scores:
                     self.limits[key].append(e.value == truth)
 
 
-def truth_of(unit: Unit, source: str, parameter: str) -> float | None:
-    """What a parameter of this camera is, as an assessment means it; None where it has no counterpart."""
+def truth_of(unit: Unit, source: str, parameter: str, settings: Mapping[str, str | int] = NO_SETTINGS) -> float | None:
+    """What a parameter of this camera is, as an assessment means it with these settings; None where it has no counterpart."""
     if source in UNCOMPARED:
         return None
+    if (source, parameter) == ("sensor.blooming", "full_well_e") and source not in unit.values:
+        return float(unit.values["sensor.full_well"]["full_well_e"])  # type: ignore[arg-type]
+    if (source, parameter) == ("electronics.flicker_noise", "rms_e") and source in unit.values and "octaves" in settings:
+        shares = octave_periods(0.1, FlickerNoise().octaves)[1]  # of the variance; slower octaves than were told are not seen
+        return float(unit.values[source][parameter]) * float(np.sqrt(shares[: int(settings["octaves"])].sum()))  # type: ignore[arg-type]
     if (source, parameter) == ("grabber.adc", "offset_dn"):
         return unit.black_dn
     if (source, parameter) == ("electronics.row_noise", "column_e") and "electronics.column_noise" in unit.values:
         offset, gain = unit.values["electronics.column_noise"]["offset_dn"], unit.values["electronics.gain"]["gain_dn_per_e"]
         return float(offset / gain)  # type: ignore[operator]
-    if source in ("electronics.row_noise", "electronics.amplifier_noise") and "electronics.flicker_noise" in unit.values:
-        return None  # which holds a part of both
     if source == "optics.shading" and unit.covered:
         return _shading_of(unit, parameter)
     record = get_source(source)

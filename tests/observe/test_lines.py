@@ -6,11 +6,14 @@ import numpy as np
 import pytest
 
 from observe.row_pictures import bars, jitter
+from pixmetry import Frames, campaign_of_arrays
+from pixmetry.assess.job import measure_sources, observe_campaign
 from pixmetry.camera.group_facts import GroupFacts
 from pixmetry.camera.observations import LineRows
 from pixmetry.camera.row_delays import added_delays, delays_ns
 from pixmetry.core.errors import MeasureError
 from pixmetry.core.number import Estimates
+from pixmetry.core.progress import no_progress
 from pixmetry.observe.experiment import PictureGroup
 from pixmetry.observe.line_jitter import with_jitter
 from pixmetry.observe.lines import LineFrames, places_of_rows
@@ -73,6 +76,21 @@ def test_the_first_rows_that_settle_are_seen_in_the_mean(rng: np.random.Generato
     assert abs(found["settling_px"].value - 1.5) < LIMIT * found["settling_px"].u
     assert abs(found["settling_rows"].value - 8.0) < LIMIT * found["settling_rows"].u
     assert found["settling_px"].u < 0.25
+
+
+def test_delays_are_in_the_time_of_the_samples(rng: np.random.Generator):
+    """0.06 px of a grabber's own 10 MHz are 6 ns, not 4.2; its beat with the pixels looks as rows that settle."""
+    bend = 1.5 * np.exp(-(np.arange(320) // 2) / 8.0)
+    frames = [Frames("line", None, bars(rng, jitter(rng, 12, 320, 0.06), BAR, bend=bend))]
+    facts = {"bits": 12, "name": "lines", "interface": "analogue", "pixel_clock_mhz": 14.1875}
+    own, same = (
+        measure_sources(observe_campaign(campaign_of_arrays(frames, **facts, **more), no_progress)[1])[0]["grabber.line_jitter"]
+        for more in ({"sampling_clock_mhz": 10.0}, {})
+    )
+    assert abs(own["white_ns"].value - 6.0) < LIMIT * own["white_ns"].u
+    assert same["white_ns"].value == pytest.approx(own["white_ns"].value / 1.41875)
+    assert "settling_ns" not in own and "beat" in own.reasons["settling_ns"]
+    assert "settling_ns" in same and any("sampling_clock_mhz" in c for c in same.confounders)
 
 
 def test_bad_pictures_say_why(rng: np.random.Generator):

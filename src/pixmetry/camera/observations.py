@@ -902,26 +902,34 @@ class Observations:
         fit = None if self.blocks is None else self.blocks.fit
         return of_pictures(fit, {n: n for n in names}, where=where, pictures="textured frames", kind="pattern")
 
+    @property
+    def sample_clock_mhz(self) -> float | None:
+        """Clock of the stored samples: of the grabber, as measured at the border of the image or as stated; else that of the pixels."""
+        area = None if self.area is None else self.area.fit
+        if area is not None and "clock_mhz" in area and not area.limits:
+            return area["clock_mhz"].value
+        return self.stated.sampling_clock_mhz or self.stated.pixel_clock_mhz
+
     def video_line(self, scales: Mapping[str, str], *, where: str) -> tuple[Estimates, float]:
-        """Take fitted values of the video line that slanted edges tell, and the pixel clock in MHz.
+        """Take fitted values of the video line that slanted edges tell, and the clock of the samples in MHz.
 
         Raises
         ------
         MeasureError
             Without edges, of a digital camera, without a stated pixel clock, or with the reason why the edges do not tell these.
         """
-        stated = self.stated
+        clock = self.sample_clock_mhz
         if self.edges is not None and self.edges.edges and self.edges.line is None:
             raise MeasureError("the camera is digital: it has no video line", where=where, remedy="state interface: analogue if it has one")
         line = None if self.edges is None or not self.edges.edges else self.edges.line
         found = of_pictures(line, scales, where=where, pictures="slanted edges", kind="edge")
-        if stated.pixel_clock_mhz is None:
+        if clock is None:
             raise MeasureError(
                 "the edges tell it in pixels, and the pixel clock is not stated",
                 where=where,
                 remedy="state pixel_clock_mhz in the manifest",
             )
-        return found, stated.pixel_clock_mhz
+        return found, clock
 
     def curve(self, names: Mapping[str, str] | Iterable[str], *, where: str) -> Estimates:
         """Take a source's parameters ``{parameter: fitted name}`` out of the response that a chart tells, with their covariance.

@@ -17,7 +17,7 @@ NOT_SIGNIFICANT = 3.0
 GAIN_REL = 0.03
 
 
-def delays_ns(found: Estimates, names: Mapping[str, str], pixel_clock_mhz: float | None, *, where: str) -> Estimates:
+def delays_ns(found: Estimates, names: Mapping[str, str], clock_mhz: float | None, *, where: str) -> Estimates:
     """Shifts of rows as delays.
 
     Parameters
@@ -26,7 +26,7 @@ def delays_ns(found: Estimates, names: Mapping[str, str], pixel_clock_mhz: float
         ``<name>_px`` in px; others as they are.
     names : mapping
         From ``<name>`` to the name in ns, or from another name to its new one.
-    pixel_clock_mhz : float or None
+    clock_mhz : float or None
         Of the samples that are stored.
     where : str
         Id of the source.
@@ -41,12 +41,12 @@ def delays_ns(found: Estimates, names: Mapping[str, str], pixel_clock_mhz: float
     MeasureError
         Without a clock.
     """
-    if pixel_clock_mhz is None:
-        remedy = "add pixel_clock_mhz under camera: the clock that samples the line"
+    if clock_mhz is None:
+        remedy = "add pixel_clock_mhz under camera; of a grabber with a clock of its own sampling_clock_mhz too"
         raise MeasureError("shifts of rows were measured in px; a delay needs the clock", where=where, remedy=remedy)
     old = [f"{name}_px" if f"{name}_px" in found else name for name in names]
     new = dict(zip(old, names.values(), strict=True))
-    scale = np.array([1e3 / pixel_clock_mhz if unit == "px" else 1.0 for unit in found.units])
+    scale = np.array([1e3 / clock_mhz if unit == "px" else 1.0 for unit in found.units])
     covariance = found.covariance * np.outer(scale, scale)
     delays = np.array(
         [

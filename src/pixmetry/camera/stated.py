@@ -13,6 +13,8 @@ class StatedFacts:
     ----------
     interface : {"digital", "analogue"}
     pixel_clock_mhz : float or None
+    sampling_clock_mhz : float or None
+        Of a frame grabber with a clock of its own.
     line_time_us : float or None
         From row to row as they are read; of two fields from line to line.
     pitch_x_um, pitch_y_um : float or None
@@ -26,6 +28,7 @@ class StatedFacts:
 
     interface: str = "digital"
     pixel_clock_mhz: float | None = None
+    sampling_clock_mhz: float | None = None
     line_time_us: float | None = None
     pitch_x_um: float | None = None
     pitch_y_um: float | None = None

@@ -67,6 +67,7 @@ class CameraFacts:
     sensor: str | None = None  # "ccd" or "cmos"
     temperature_c: float | None = None
     pixel_clock_mhz: float | None = None
+    sampling_clock_mhz: float | None = None  # of a frame grabber with a clock of its own
     line_time_us: float | None = None  # from row to row as they are read; of two fields from line to line
     cfa: str | None = None  # colour filter of a mosaic: the colours of pixels (0,0), (0,1), (1,0), (1,1), e.g. "RGGB"
     vendor: str | None = None
@@ -181,6 +182,7 @@ class Campaign:
         return StatedFacts(
             interface=c.interface,
             pixel_clock_mhz=c.pixel_clock_mhz,
+            sampling_clock_mhz=c.sampling_clock_mhz,
             line_time_us=c.line_time_us,
             pitch_x_um=c.pitch_x_um,
             pitch_y_um=c.pitch_y_um or c.pitch_x_um,

@@ -55,6 +55,7 @@ class CameraModel(Model):
     sensor: Literal["ccd", "cmos", "cid"] | None = None
     temperature_c: Annotated[float, Field(ge=-273.15)] | None = None
     pixel_clock_mhz: Positive | None = None
+    sampling_clock_mhz: Positive | None = None
     line_time_us: Annotated[float, Field(gt=0, le=1e5)] | None = None
     cfa: Literal["RGGB", "BGGR", "GRBG", "GBRG"] | None = None
     vendor: Text | None = None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -16,6 +17,12 @@ from pixmetry.camera.source import Parameters, Source, quantity
 from pixmetry.core.errors import MeasureError
 from pixmetry.core.number import Estimates
 from pixmetry.core.random import Grid, Stream
+
+BEAT = "not separable from the beat of the grabber's clock with the pixels: sample by the pixel clock"
+OWN_CLOCK = (
+    "grabber.sampling_clock: delays and periods are in the time of the pixel clock; of a grabber that samples by a clock of its own they "
+    "are wrong by the ratio of the two, and its beat with the pixels looks like a settling: state camera.sampling_clock_mhz"
+)
 
 
 class LineJitter(Parameters):
@@ -84,7 +91,13 @@ def measure(observations: Observations) -> Estimates:
     names = {"white": "white_ns", "loop": "loop_ns", "settling": "settling_ns"}
     kept = ("loop_rows", "settling_rows", "interlaced")
     found = observations.row_jitter({f"{n}_px": f"{n}_px" for n in names} | {n: n for n in kept}, where="grabber.line_jitter")
-    return delays_ns(found, names, observations.stated.pixel_clock_mhz, where="grabber.line_jitter")
+    clock = observations.sample_clock_mhz
+    told = delays_ns(found, names, clock, where="grabber.line_jitter")
+    if clock != observations.stated.pixel_clock_mhz:
+        left = told.select([name for name in told.names if not name.startswith("settling")])
+        return replace(left, reasons={**left.reasons, "settling_ns": BEAT})
+    known = observations.stated.sampling_clock_mhz is not None or observations.area is not None
+    return told if known else replace(told, confounders=(*told.confounders, OWN_CLOCK))
 
 
 def propagate(params: LineJitter, probe: Probe) -> Contribution:

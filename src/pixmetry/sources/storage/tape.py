@@ -181,13 +181,13 @@ def measure(observations: Observations) -> Estimates:
         )
     added = added_delays(played, observations.lines.jitter, where="storage.tape")
     return delays_ns(
-        added, {"white": "white_ns", "loop": "wow_ns", "loop_rows": "wow_rows"}, observations.stated.pixel_clock_mhz, where="storage.tape"
+        added, {"white": "white_ns", "loop": "wow_ns", "loop_rows": "wow_rows"}, observations.sample_clock_mhz, where="storage.tape"
     )
 
 
 def _by_recordings(observations: Observations, seen: Recordings) -> Estimates:
     """Bandwidth, noise, time base and step of the heads, by a scene seen directly and recorded."""
-    where, clock = "storage.tape", observations.stated.pixel_clock_mhz
+    where, clock = "storage.tape", observations.sample_clock_mhz
     found = observations.recorder(
         {"bandwidth_mhz": "bandwidth_rel", "noise_dn": "noise_dn", "head_switch_ns": "head_switch_px"},
         where=where,
