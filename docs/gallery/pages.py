@@ -52,9 +52,9 @@ EXPERIMENTS = {  # pages with modules of their own: where in the chapter, title,
     ),
 }  # fmt: skip
 ORDER = (
-    "error-table", "camera-data", "grabber-warm-up", "sampling-clock", "laser-speckle", "interlace", "gamma", "video-tape", "threshold",
-    "unflatness", "cable", "window-offset", "offset", "camera-filter", "camera-warm-up", "charge-transfer", "amplifier-noise",
-    "quantisation", "line-jitter", "fixed-pattern", "super-resolution", "pixel-places",
+    "error-table", "camera-data", "grabber-warm-up", "sampling-clock", "laser-speckle", "interlace", "gamma", "low-pass", "video-tape",
+    "threshold", "unflatness", "cable", "window-offset", "offset", "camera-filter", "camera-warm-up", "charge-transfer",
+    "amplifier-noise", "quantisation", "line-jitter", "fixed-pattern", "super-resolution", "pixel-places",
 )  # as in the chapter  # fmt: skip
 NOTES = tuple(name for name in ORDER if name not in EXPERIMENTS)
 

@@ -1,4 +1,4 @@
-"""Sixteen frames shifted by quarters of a pixel, put together: what comes back beyond the limit of one frame."""
+"""Four frames shifted by quarters of a pixel, put together: what comes back beyond the limit of one frame."""
 
 import numpy as np
 
