@@ -13,7 +13,7 @@ from pixmetry.core.errors import InputError
 from pixmetry.files.formats import Decoded
 from pixmetry.files.images import load_picture
 from pixmetry.files.raw_values import RawLayout
-from pixmetry.locate.detect.grids import Grid
+from pixmetry.locate.detect.grids import LEAST_WHOLE, Grid
 from pixmetry.locate.detect.targets import Flag, Positions
 from pixmetry.locate.frame import checked_frame, scale_ends
 from pixmetry.locate.job import locate
@@ -167,6 +167,10 @@ def _dots(name: str, frame: np.ndarray, wanted: Wanted) -> Seen:
     if placed.sum() < 4 or wanted.grid not in (None, (cols, rows)):
         return _nothing(name, frame, f"{len(found)} dots were seen: {found.images[0]['grid']}")
     use = placed & _usable(found)
+    if use.sum() < LEAST_WHOLE * wanted.whole:
+        return _nothing(
+            name, frame, f"{len(found)} dots were seen: too much of {cols} × {rows} is missing to be sure of its rows and columns"
+        )
     seen = _seen(name, frame, found, keys, use, (rows, cols))
     tilted = "semi_major_px" in found.columns
     area = (found["semi_major_px"] * found["semi_minor_px"] if tilted else found["radius_px"] ** 2)[use]
@@ -184,8 +188,12 @@ def _asymmetric(name: str, frame: np.ndarray, wanted: Wanted) -> Seen:
         return _nothing(name, frame, f"{len(found)} dots were seen: {grid.message}")
     keys = np.column_stack([grid.row, np.where(grid.placed, 2 * grid.col + grid.row % 2, -1)])
     in_row, in_col = (np.bincount(key[grid.placed], minlength=n) for key, n in zip(keys.T, (rows, 2 * cols), strict=True))
-    if in_row[[0, -1]].min() < RIM_SHARE * cols or in_col[[0, -1]].min() < RIM_SHARE * (rows // 2):
-        return _nothing(name, frame, f"{len(found)} dots were seen: an outermost row or column of {cols} × {rows} is hardly there")
+    if (
+        grid.placed.sum() < LEAST_WHOLE * wanted.whole
+        or in_row[[0, -1]].min() < RIM_SHARE * cols
+        or in_col[[0, -1]].min() < RIM_SHARE * (rows // 2)
+    ):
+        return _nothing(name, frame, f"{len(found)} dots were seen: too much of {cols} × {rows} is missing")
     return _seen(name, frame, found, keys, grid.placed & _usable(found), (rows, 2 * cols))
 
 

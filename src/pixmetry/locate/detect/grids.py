@@ -14,6 +14,7 @@ FILL_TOLERANCE = 0.2  # the same for dots beyond a gap
 OUTLIER = 0.15  # of the pitch: farther from the homography through its neighbours, a dot is not on the grid
 AROUND = 12  # dots through which that homography is laid
 LARGEST_GAP = 3  # steps
+LEAST_WHOLE = 0.85  # of the dots of a plate of known size, from which it is numbered
 MOST_BESIDE = 0.2  # dots of something else that continue the grid of a plate, over those of the plate
 RIM_SHARE = 0.3  # of the dots of an outermost row or column, from which it is one
 LARGEST_INDEX = 1024  # rows or columns on one side of the first dot
@@ -91,7 +92,7 @@ def order_grid(x_px: np.ndarray, y_px: np.ndarray, *, pattern: tuple[int, int] |
     perspective and distortion, so nothing is assumed about either. Dots beyond a gap are placed by the homography through their
     12 nearest placed dots. Last, a dot that is more than 0.15 steps off the one through its own neighbours is an outlier.
 
-    The rows and columns at the rim of a plate of known size must be there: 0.3 of the dots of each, at least. So must the end of the plate:
+    A plate of known size must be there: 0.85 of its dots, and 0.3 of each row and column at its rim. So must its end:
     a next row or column with 0.3 of its dots belongs to a larger plate, and no part of that is numbered.
     """
     x, y = np.asarray(x_px, float).ravel(), np.asarray(y_px, float).ravel()
@@ -342,7 +343,11 @@ def _numbered(
     full = np.full(index.shape, -1)
     full[known] = cells
     if pattern is not None and corner is None and not asymmetric and (cols, rows) == tuple(pattern):
-        return full, (rows, cols), f"a grid of {cols} × {rows}, but with an outermost row or column that is hardly there"
+        return (
+            full,
+            (rows, cols),
+            f"a grid of {cols} × {rows}, but too much of it is missing, or an outermost row or column is hardly there",
+        )
     wrong = pattern is not None and (cols, rows) != tuple(pattern)
     return full, (rows, cols), f"a grid of {cols} × {rows}, not {pattern[0]} × {pattern[1]}" if wrong and pattern else ""
 
@@ -365,7 +370,8 @@ def _corner(cells: np.ndarray, pattern: tuple[int, int]) -> np.ndarray | None:
     whole = np.array([cols, cols, rows, rows])
     within = inside[top, left]
     alone = len(cells) - within <= MOST_BESIDE * within  # the dots of a plate that is counted along a diagonal leave a window of its size
-    sure = alone and (np.array(rims) >= RIM_SHARE * whole).all() and (np.array(beyond) < RIM_SHARE * whole).all()
+    whole_plate = within >= LEAST_WHOLE * rows * cols  # part of it, counted along a diagonal, may have its size too
+    sure = alone and whole_plate and (np.array(rims) >= RIM_SHARE * whole).all() and (np.array(beyond) < RIM_SHARE * whole).all()
     return np.array([top, left]) - 1 if sure else None
 
 
