@@ -79,7 +79,7 @@ def test_the_directions_convert_into_each_other() -> None:
     assert converted(model, "image_to_object").largest_px == 0
 
 
-@pytest.mark.parametrize("kind", set(COLMAP) - {"OPENCV_FISHEYE"})
+@pytest.mark.parametrize("kind", sorted(set(COLMAP) - {"OPENCV_FISHEYE"}))
 def test_colmap_sees_the_same_pixels_half_a_pixel_further(kind: str, rng: np.random.Generator) -> None:
     points = looks(rng)
     kept = {n: v for n, v in (LENS | {"b1": 2e-3}).items() if n in COLMAP[kind]}
