@@ -351,6 +351,9 @@ def _drawn(frame: np.ndarray, targets: Targets, positions: Positions, i: int, ki
     from pixmetry.locate.template.template_fit import REACH, start_values
 
     one = targets[i : i + 1]
+    # an ellipse's own unknowns follow from its axes and direction, which stand in the table
+    shape = {n: positions.more[n][i : i + 1] for n in ("semi_major_px", "semi_minor_px", "angle_deg", "blur_px") if n in positions.more}
+    one = replace(one, **shape)
     start, outer, edge = start_values(one, kind, aperture_px)
     names = (*PARAMETERS[kind], *PLANES)
     given = {"x_px": positions.x_px[i], "y_px": positions.y_px[i]} | {n: v[i] for n, v in positions.more.items() if n in names}
