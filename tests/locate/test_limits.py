@@ -86,7 +86,9 @@ def test_bad_limits_are_refused(frame: np.ndarray) -> None:
     for wrong in (
         {"rois": [(0, 0, 241, 10)]}, {"rois": [(0, 0, 10)]}, {"rois": [(0.5, 0, 10, 10)]}, {"mask": np.ones((3, 3), bool)},
         {"places_px": [[1.0, np.nan]]}, {"places_px": [1.0, 2.0]}, {"diameter_px": (5, 3)}, {"contrast_dn": (-1, 3)},
-        {"threshold_sigma": 0.0}, {"kind": "line", "diameter_px": (1, 2)},
+        {"threshold_sigma": 0.0}, {"kind": "line", "diameter_px": (1, 2)}, {"diameter_px": 5}, {"threshold_sigma": "4"},
+        {"rois": [(np.inf, 0, 3, 3)]}, {"rois": [(np.nan, 0, 3, 3)]}, {"rois": (0, 0, 10, 10)}, {"places_px": [("a", "b")]},
+        {"places_px": [(1.0,), (2.0, 3.0)]}, {"mask": np.ones((240, 320))},
     ):  # fmt: skip
         with pytest.raises(InputError):
             locate(frame, **wrong)

@@ -132,6 +132,46 @@ def test_numbers_last_through_crossings(rng: np.random.Generator) -> None:
             assert np.hypot(*np.diff([found.x_px, found.y_px])[:, 0]) > 2
 
 
+@pytest.mark.parametrize("opaque", [True, False])
+@pytest.mark.parametrize(("speed", "beside"), [((2.0, 2.0), 2.2), ((1.0, 2.6), 4.5), ((2.5, 1.2), 6.0)])
+def test_two_that_were_one_region_go_on(opaque: bool, speed: tuple[float, float], beside: float, rng: np.random.Generator) -> None:
+    """Discs that touch, cover each other or add their light on the way teach no false motion; no wrong position is without a flag."""
+    tracker = None
+    for k in range(-20, 21):
+        x, y = 64.0 + np.array([speed[0], -speed[1]]) * k, np.array([45.0, 45.0 + beside])
+        one, other = (discs(x[i], y[i], 5.0, height=80.0) for i in (0, 1))
+        frame = exposed(np.maximum(one, other) if opaque else one + other - 20.0, rng)
+        if tracker is None:
+            tracker = Tracker(frame, noise=NOISE)
+            order = np.argsort(tracker.latest.x_px)
+            continue
+        found = tracker.update(frame)
+        off = np.hypot(found.x_px[order] - x, found.y_px[order] - y)
+        doubtful = (found.flags[order] & (Flag.OVERLAPPING | Flag.BORDER | Flag.NOT_CONVERGED)) != 0
+        assert (doubtful | (off < 0.5)).all(), k
+    assert (off < 0.1).all()
+    s = tracker.statistics()
+    np.testing.assert_allclose(s.drift_x_px[order], [speed[0], -speed[1]], atol=0.01)
+
+
+def test_a_target_that_leaves_the_frame_does_not_bend_its_drift(rng: np.random.Generator) -> None:
+    tracker = Tracker(exposed(discs(90.0, 45.0), rng), noise=NOISE)
+    for k in range(1, 36):
+        tracker.update(exposed(discs(90.0 + 1.3 * k, 45.0), rng))
+    assert abs(tracker.statistics().drift_x_px[0] - 1.3) < 0.01
+
+
+def test_times_count_from_any_instant(rng: np.random.Generator) -> None:
+    at, sums = rng.normal(0, 0.01, (30, 2)), [Statistics(1), Statistics(1)]
+    for k in range(30):
+        for one, start in zip(sums, (0.0, 1.7e9), strict=True):  # seconds since 1970
+            one.add(start + 0.25 * k, np.array([[*at[k] + k, 0.04, 0.0, 0.09]]), np.array([0.1]), np.ones(1, bool))
+    first, second = (one.result() for one in sums)
+    np.testing.assert_allclose(second.drift_x_px, first.drift_x_px, rtol=1e-9)
+    np.testing.assert_allclose(second.u_drift_x_px, first.u_drift_x_px, rtol=1e-6)
+    assert abs(first.drift_x_px[0] - 4) < 0.05
+
+
 def test_a_common_jump_of_the_image_loses_no_target(rng: np.random.Generator) -> None:
     """All discs jump by 9 px, which is more than the search of those that are near another."""
     x, y = np.array([20.0, 36.0, 60.0, 60.0, 90.0]), np.array([20.0, 20.0, 50.0, 75.0, 30.0])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
@@ -51,14 +52,17 @@ class Limits:
     def __post_init__(self) -> None:
         for name in ("diameter_px", "contrast_dn"):
             pair = getattr(self, name)
-            if pair is not None and not (len(pair) == 2 and 0 <= pair[0] < pair[1]):
+            if pair is not None and not _is_range(pair):
                 raise InputError("not a range", where=name, value=pair, allowed="least and greatest, 0 or more, such as (3, 40)")
         if self.rois is not None and not len(self.rois):
             raise InputError("no region to look in", where="rois", remedy="name one, or leave them out")
-        if not (np.isfinite(self.threshold_sigma) and self.threshold_sigma > 0):
+        if not (_is_number(self.threshold_sigma) and 0 < self.threshold_sigma < math.inf):
             raise InputError("a threshold that cannot be used", where="threshold_sigma", value=self.threshold_sigma, allowed="above 0")
         if self.places_px is not None:
-            places = np.asarray(self.places_px, float)
+            try:
+                places = np.asarray(self.places_px, float)
+            except (TypeError, ValueError):
+                places = np.empty(0)
             if places.ndim != 2 or places.shape[1] != 2 or not len(places) or not np.isfinite(places).all():
                 raise InputError("not places", where="places_px", value=places.shape, allowed="shape (n, 2): x and y of one target or more")
 
@@ -84,7 +88,7 @@ class Limits:
             try:
                 row, col, rows, cols = (int(v) for v in roi)
                 row = row if all(int(v) == v for v in roi) else -1
-            except (TypeError, ValueError):
+            except (TypeError, ValueError, OverflowError):
                 row = col = rows = cols = -1
             if min(row, col) < 0 or min(rows, cols) < 1 or row + rows > shape[0] or col + cols > shape[1]:
                 allowed = f"row, col, rows, cols within {shape[0]} × {shape[1]} pixels (rows × columns)"
@@ -110,8 +114,10 @@ class Limits:
 
         if self.mask is not None:
             mask = np.asarray(self.mask)
-            if mask.shape != shape or mask.dtype.kind not in "bui":
+            if mask.shape != shape:
                 raise InputError("a mask of another size", where="mask", value=mask.shape, allowed=f"{shape}, True where targets may be")
+            if mask.dtype.kind not in "bui":
+                raise InputError("not a mask", where="mask", value=str(mask.dtype), allowed="True or False, or whole numbers")
             row, col = (np.clip(np.rint(v).astype(int), 0, side - 1) for v, side in zip((targets.y_px, targets.x_px), shape, strict=True))
             keep(mask[row, col] != 0, "outside the mask")
         if self.diameter_px is not None:
@@ -137,6 +143,14 @@ class Wanted(NamedTuple):
     rows: np.ndarray  # indices, shape (m,), in the order of the given places where there are such
     left_out: LeftOut
     place: np.ndarray | None  # shape (m,): number of the given place of each
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
+
+
+def _is_range(pair: Any) -> bool:
+    return isinstance(pair, Sequence | np.ndarray) and len(pair) == 2 and all(map(_is_number, pair)) and 0 <= pair[0] < pair[1]
 
 
 def _at_places(targets: Targets, places: np.ndarray) -> np.ndarray:

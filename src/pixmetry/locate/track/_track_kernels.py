@@ -38,13 +38,16 @@ from pixmetry.locate.detect._region_kernels import (
     waisted,
 )
 
-LOST, SEEN, FAINT = 0, 1, 2  # not there; seen as a region; too faint for a region, and taken to be where it is expected
+LOST, SEEN, FAINT, MERGED = 0, 1, 2, 3
+"""Not there; seen as a region; too faint for a region, and taken to be where it is expected; one region with another target."""
 RING = 24  # samples of the background around a target
 SKIRT = 3.5  # standard deviations of the blur beyond the half-height contour that belong to a target
 SLACK_PX = 2.0  # about the expected place, for a first look
 WIDER = 3.0  # ratio of one look to the next
 LEAST_AREA = 3  # pixels, as in detection
 AREA_RATIO, HEIGHT_RATIO = 2.0, 2.5  # by which a target may change from frame to frame
+MERGED_RATIO = 1.25  # of the area, from which a region that is no single disc is that of two
+SHARED_RATIO = 1.1  # the same, of a region in which another target is expected that was not met
 COMMON_PX = 0.5  # a common step from which on lost targets are looked for again
 SAME = 0.3  # of the half axis: two targets that are nearer to each other are one
 USUAL_CHANGE, MOST_CHANGE = 0.1, 0.7  # of the logarithm of sizes and blurs: all of them, or one, for other thresholds
@@ -241,8 +244,11 @@ def common_step(expected: Array, found: Array, met: Ints) -> tuple[int, float, f
 
 
 @jit
-def part_claims(expected: Array, found: Array, start: Ints, index: Ints, met: Ints) -> None:
-    """Where two targets were met at one place, leave it to the one that was expected nearer."""
+def part_claims(expected: Array, found: Array, known: Array, start: Ints, index: Ints, met: Ints) -> None:
+    """Where two targets were met at one place, leave it to the one that was expected nearer.
+
+    A region that has another area than its target had, and in which one is expected that was not met, is that of both.
+    """
     for i in range(len(met)):
         for k in range(start[i], start[i + 1]):
             j = index[k]
@@ -252,6 +258,15 @@ def part_claims(expected: Array, found: Array, start: Ints, index: Ints, met: In
                     one = math.hypot(found[i, 0] - expected[i, 0], found[i, 1] - expected[i, 1])
                     other = math.hypot(found[j, 0] - expected[j, 0], found[j, 1] - expected[j, 1])
                     met[j if one <= other else i] = LOST
+    for i in range(len(met)):
+        for k in range(start[i], start[i + 1]):
+            j = index[k]
+            if met[i] == SEEN and met[j] == LOST:
+                apart = math.hypot(found[i, 0] - expected[j, 0], found[i, 1] - expected[j, 1])
+                alike = known[i, 11] / SHARED_RATIO < found[i, 11] < known[i, 11] * SHARED_RATIO
+                if apart < found[i, 2] + known[j, 2] and not alike:
+                    found[i, 14] = int(found[i, 14]) | OVERLAPPING
+                    met[i] = MERGED
 
 
 @jit
@@ -266,11 +281,19 @@ def boxes_moved(region: Array, box: Ints) -> bool:
 
 @jit
 def take_regions(kept: Kept, expected: Array, found: Array, planes: Array, met: Ints) -> None:
-    """Put what was found in the place of what was known; what was not found goes on as it was expected."""
+    """Put what was found in the place of what was known; what was not found goes on as it was expected.
+
+    A region that has grown and is no single disc is two targets in one: its place says nothing of the motion of either.
+    """
     for i in range(len(met)):
         region = kept.region[i]
-        if met[i] == SEEN:
+        if met[i] == SEEN or met[i] == MERGED:
+            area = region[11]
             region[:] = found[i]
+            if int(region[14]) & OVERLAPPING and region[11] > MERGED_RATIO * area:
+                met[i] = MERGED
+            if met[i] == MERGED:
+                region[11] = area
         else:
             dx, dy = expected[i, 0] - region[0], expected[i, 1] - region[1]
             region[0], region[1] = expected[i, 0], expected[i, 1]
@@ -336,7 +359,7 @@ def settle(kept: Kept, expected: Array, met: Ints, result: Array, at_rest: Flags
     conclude(result, at_rest, kept.disc[:, 2], kept.s_curve, kept.row_shift, flags)
     widen(kept, result)
     for i in range(len(met)):
-        if not at_rest[i]:
+        if not at_rest[i] or met[i] == MERGED:
             kept.gap[i] += 1
             continue
         steps, share = kept.gap[i] + 1.0, 1.0 if kept.seen[i] <= 1 else NEW
@@ -378,7 +401,7 @@ def shift_lost(expected: Array, found: Array, met: Ints) -> bool:
 @jit
 def take_all(kept: Kept, expected: Array, found: Array, planes: Array, start: Ints, index: Ints, met: Ints) -> None:
     """Settle to whom the found regions belong, and take them."""
-    part_claims(expected, found, start, index, met)
+    part_claims(expected, found, kept.region, start, index, met)
     take_regions(kept, expected, found, planes, met)
 
 

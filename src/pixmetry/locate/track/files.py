@@ -23,6 +23,8 @@ from pixmetry.files.raw_values import RawLayout, layout_of
 from pixmetry.files.strict_json import json_text
 from pixmetry.locate.detect.targets import Flag
 from pixmetry.locate.files import frames_inside
+from pixmetry.locate.frame import looks_like_mosaic
+from pixmetry.locate.job import MOSAIC
 from pixmetry.locate.noise import NoiseModel, noise_model
 from pixmetry.locate.records import ORIGIN
 from pixmetry.locate.track.statistics import TrackStatistics, disagreements
@@ -49,7 +51,7 @@ class TrackedFiles:
         Estimator, and noise model in words.
     statistics : TrackStatistics
     told : tuple of str
-        Targets whose scatter and stated uncertainty disagree, in sentences.
+        In sentences: what is wrong with the frames, and targets whose scatter and stated uncertainty disagree.
     """
 
     frames: int
@@ -114,7 +116,7 @@ def track_files(
     InputError, MeasureError
         If a file or an option cannot be used, or the first frame shows no target; nothing is written then.
     """
-    if interval_s is not None and not interval_s > 0:
+    if interval_s is not None and not 0 < interval_s < np.inf:
         raise InputError("not an interval", where="interval_s", value=interval_s, allowed="above 0 s")
     layout, report = layout_of(raw), progress or no_progress
     files = picture_files([frames_inside(path) for path in images], PICTURE_ENDINGS, layout)
@@ -132,6 +134,7 @@ def track_files(
                 if k == 0:
                     tracker = Tracker(frame, noise=noise_model(noise), time=0.0, threads=threads, **options)
                     found = tracker.latest
+                    caution = (MOSAIC,) if looks_like_mosaic(frame) else ()
                     if out is not None:
                         out.write(_head(tracker, "second" if interval_s else "frame").encode())
                 else:
@@ -145,7 +148,7 @@ def track_files(
                 out.write(_rows(frame_name(files[k]), found))
             report("tracking", k + 1, len(files))
         result = tracker.statistics()
-        told = disagreements(result, tracker.noise.origin)
+        told = (*caution, *disagreements(result, tracker.noise.origin))
         whole = TrackedFiles(len(files), len(tracker), lost, tracker.estimator, tracker.noise.describe(), result, told)
         if note is not None:
             note.write(json_text(whole.to_record()).encode())

@@ -24,7 +24,7 @@ class TrackStatistics:
     Parameters
     ----------
     frames : ndarray of int
-        In which the target was found.
+        In which the target was found, alone and whole: not as one region with another target, nor cut by a border that it has reached.
     mean_x_px, mean_y_px : ndarray
     std_x_px, std_y_px : ndarray
         Standard deviation of all positions: noise and motion.
@@ -108,10 +108,12 @@ class Statistics:
             common=np.zeros(3), half=np.zeros((n, 2, OCTAVES)), mean=np.zeros((n, 2, OCTAVES)), state=np.zeros((n, OCTAVES), ints),
             allan=np.zeros((n, 2, OCTAVES)), allans=np.zeros((n, OCTAVES), ints),
         )  # fmt: skip
+        self._start: float | None = None
 
     def add(self, time: float, result: np.ndarray, s_curve_px: np.ndarray, found: np.ndarray) -> None:
         """Add the positions of a frame; ``result`` (n, 5 or more): x, y, var x, cov, var y."""
-        accumulate(self.sums, time, result, s_curve_px, found)
+        self._start = time if self._start is None else self._start
+        accumulate(self.sums, time - self._start, result, s_curve_px, found)  # seconds since 1970 have no digits left in their squares
 
     def result(self) -> TrackStatistics:
         """What the frames so far say."""

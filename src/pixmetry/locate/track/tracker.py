@@ -85,6 +85,8 @@ class Tracker:
         As of `pixmetry.locate`. The noise is that of the first frame, if it is not given.
     search_px : float, optional
         How far from its expected place a target is looked for; by default 0.4 of the distance to the nearest neighbour, 25 px at most.
+    time : float, optional
+        Of the first frame, in the unit of those given to `update`; by default 0.
     threads : int, optional
 
     Attributes
@@ -109,7 +111,8 @@ class Tracker:
     of the whole frame's background says otherwise about the region's outline.
 
     A target that is not found keeps its number, and is looked for where its motion would have brought it. Of two that were found at one
-    place, as when one covers the other, it is the one that was expected nearer.
+    place, as when one covers the other, it is the one that was expected nearer. Where the region there is larger or smaller than that
+    target was, it is flagged `overlapping`: its position tells nothing of the motion, and is not in the statistics.
 
     Examples
     --------
@@ -181,7 +184,7 @@ class Tracker:
         ----------
         frame : ndarray, shape (rows, cols)
         time : float, optional
-            In any unit; by default the number of the frame.
+            In any unit, counted from any instant, but the same for all frames; by default the number of the frame.
 
         Raises
         ------
@@ -232,7 +235,8 @@ class Tracker:
         self._law = k.Law(code, MARGINS.get(self.estimator, 3.5), whole, _shapes())
         self._planes = np.stack([t.background_dn, t.background_x_dn_per_px, t.background_y_dn_per_px], axis=1).astype(float)
         self._expected, self._found, self._met = at.copy(), region.copy(), np.full(n, k.SEEN)
-        self._statistics, self._frame, self._chosen = Statistics(n), -1, False
+        self._statistics, self._frame = Statistics(n), -1
+        self._cut_at_first = (targets.flags & Flag.BORDER) != 0
         self._find_neighbours()
         self._measure(image, time)
 
@@ -313,9 +317,17 @@ class Tracker:
             self._over(lambda a, b: k.measure(image, kept, *near, self._law, noise, a, b, result, at_rest))
             k.settle(kept, expected, met, result, at_rest, flags)
         s_curve = kept.s_curve.copy()
-        self._statistics.add(when, result, s_curve, at_rest)
+        self._statistics.add(when, result, s_curve, at_rest & self._alone_and_whole(flags))
         x, y, xx, xy, yy, _ = result.T.copy()
         return Tracked(self._frame, when, x, y, xx, xy, yy, s_curve, flags)
+
+    def _alone_and_whole(self, flags: np.ndarray) -> np.ndarray:
+        """Which positions are those of one target: of no region that is two, nor of one that leaves the frame."""
+        from pixmetry.locate.track import _track_kernels as k
+
+        cut = ((flags & Flag.BORDER) != 0) & ~self._cut_at_first
+        alone: np.ndarray = (self._met != k.MERGED) & ~cut
+        return alone
 
     def _choose_thresholds(self, image: np.ndarray) -> None:
         """Choose thresholds, and the variance over the phase, for targets of these sizes."""
@@ -357,7 +369,7 @@ class Tracker:
             flags,
         )
         k.widen(kept._replace(s_curve=s_curve, shared=shared), result)
-        self._statistics.add(when, result, s_curve, at_rest)
+        self._statistics.add(when, result, s_curve, at_rest & self._alone_and_whole(flags))
         more = {}
         for name, values in found.more.items():
             more[name] = np.full(n, np.nan)
