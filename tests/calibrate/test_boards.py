@@ -122,3 +122,11 @@ def test_boards_that_cannot_be_are_refused(kind: str, options: dict, what: str) 
         board_of(kind, (9, 6), 20.0, **options)
     with pytest.raises(InputError, match="size of a board"):
         board_of("dots", (2, 6), 20.0)
+
+
+def test_a_fine_pitch_is_written_to_the_digit() -> None:
+    """The far corner of a wide board, whose pitch has seven digits, and the options that tell it."""
+    board = board_of("chessboard", (80, 6), 12.34567)
+    _, x, y, _ = next(row for row in board.coordinates_csv().splitlines() if row.startswith("5/79,")).split(",")
+    assert (float(x), float(y)) == pytest.approx((79 * 12.34567, 5 * 12.34567), abs=1e-5)
+    assert board.options.endswith("--pitch-mm 12.34567")

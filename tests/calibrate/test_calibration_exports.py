@@ -163,3 +163,12 @@ def test_none_holds_all() -> None:
     network = simulate(default_rng(1), images=4, points=10).network
     network = replace(network, cameras=tuple(m.with_values(c=20.0) for m in network.cameras))
     assert not _changed(network, "none", None).cameras[0].free.any()
+
+
+def test_what_ros_loses_is_told(tmp_path: Path) -> None:
+    """ROS has no thin prisms: they displace by up to some tenths of a pixel, and the sentence says so."""
+    model = CameraModel.of(Sensor(1280, 960), "object_to_image", c=900, k1=-0.1, s1=3e-4, s3=-2e-4)
+    made = write_exports([model], {"ros": tmp_path / "ros.yaml", "mrcal": tmp_path / "a.cameramodel"}, 1.0)
+    lost = {sentence.partition(" for ")[2].partition(";")[0]: sentence for sentence in made.sentences}
+    assert "nothing is lost" in lost["mrcal"] and "px are lost" in lost["ROS"] and not made.refused
+    assert write_exports([model], {"ros": tmp_path / "ros.yaml"}).refused

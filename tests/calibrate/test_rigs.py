@@ -22,10 +22,11 @@ from pixmetry.calibrate.bundle.rig import relative_poses
 from pixmetry.calibrate.bundle.solve import calibrate_network
 from pixmetry.calibrate.checks.added_terms import AddedTerms
 from pixmetry.calibrate.checks.rig_check import epipolar_records, rig_findings, rig_record, rigid_test
+from pixmetry.calibrate.files.exports import kalibr_text
 from pixmetry.calibrate.project import load_project
 from pixmetry.calibrate.project.rig_names import cameras_of_files, instants_of_names
 from pixmetry.calibrate.rig_pair import CameraPair, camera_pair
-from pixmetry.core.errors import InputError
+from pixmetry.core.errors import InputError, MeasureError
 
 RATE = 1e-6
 CHESSBOARDS = Path(os.environ.get("PIXMETRY_DATA", "")) / "opencv-chessboards"
@@ -250,6 +251,31 @@ def test_a_project_names_the_instants(rig, rng, tmp_path):
     page = (tmp_path / "result" / "report.html").read_text()
     assert "Did the cameras stand still?" in page and "epipolar" in page
     assert stored.epipolar[0].n == found.tests.rig.epipolar[0].n
+
+
+def test_images_that_fit_no_rig_are_named(rng):
+    """A board that one camera counts from its other end, and images of other instants: the reason is the rig, no camera."""
+    sim = simulated_rig(rng, instants=6)
+    net, options = sim.network, Options(folds=0, field="fixed")
+    other = net.camera_of[net.image] == 1
+    half_turn = replace(net, point=np.where(other, len(net.points) - 1 - net.point, net.point))
+    for wrong in (half_turn, replace(net, instant=np.where(net.camera_of == 1, (net.instant + 1) % 6, net.instant))):
+        with pytest.raises(MeasureError, match=r"rig: the images fit when each .* cam[01]-0\d is turned by \d+°"):
+            calibrate_network(wrong, options)
+
+
+def test_cameras_that_no_instant_joins_are_all_named(rng):
+    """Two pairs that share no instant: the second is told against its own first camera, and both of it are not joined to the first pair."""
+    missing = tuple((k, t) for t in range(8) for k in range(4) if (k < 2) != (t < 4))
+    sim = simulated_rig(rng, cameras=4, instants=8, missing=missing)
+    record = rig_record(adjust(sim.network, sim.truth))
+    assert record.unjoined == ("cam2", "cam3") and list(record.frames()) == ["cam0", "cam1"]
+    assert [(one.camera, one.reference) for one in record.cameras] == [("cam1", "cam0"), ("cam3", "cam2")]
+    (finding,) = rig_findings(replace(record, rigid=None), instants_given=True)
+    assert finding.text.endswith("to cam0: cam2, cam3.")
+    text = kalibr_text([replace(model, direction="object_to_image") for model in sim.network.cameras], 0.0, record)
+    assert text.count("T_cn_cnm1") == 1
+    assert [line.strip() for line in text.splitlines() if "overlaps" in line] == [f"cam_overlaps: {of}" for of in ([1], [0], [], [])]
 
 
 def test_a_project_takes_instants_from_names(rng, tmp_path):

@@ -1391,7 +1391,7 @@ class RigRecord:
     epipolar : tuple of EpipolarRecord
     rigid : RigidTest or None
     unjoined : tuple of str
-        Cameras that share no instant with the others.
+        Cameras that no chain of common instants joins to the reference of the first of ``cameras``.
     """
 
     instants: int
@@ -1402,6 +1402,15 @@ class RigRecord:
     rigid: RigidTest | None = None
     widened: float = 1.0
     unjoined: tuple[str, ...] = ()
+
+    def frames(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """Rotation and projection centre of each camera in the frame of the first reference, which is the first of them."""
+        if not self.cameras:
+            return {}
+        root = self.cameras[0].reference
+        return {root: (np.eye(3), np.zeros(3))} | {
+            one.camera: (one.rotation, one.position) for one in self.cameras if one.reference == root
+        }
 
 
 @dataclass(frozen=True)

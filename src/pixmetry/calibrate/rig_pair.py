@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from pixmetry.calibrate.files.record import StoredCalibration
     from pixmetry.calibrate.records import Calibration
 
-EDGE = 33  # places along an edge of the frame at which its rectified size is looked at
-
 
 @dataclass(frozen=True)
 class CameraPair:
@@ -75,8 +73,6 @@ class CameraPair:
         InputError
             If the cameras stand at one place, or look along their baseline.
         """
-        from scipy.spatial.transform import Rotation
-
         base = -self.rotation.T @ self.translation  # from the first to the second, in the frame of the first
         length = float(np.linalg.norm(base))
         axes = np.array([0.0, 0.0, 1.0]) + self.rotation[2]
@@ -97,7 +93,6 @@ class CameraPair:
             ray = np.column_stack([*model.direction_of(*np.reshape(model.sensor.centre, (2, 1))), [1.0]]) @ turn.T
             middles.append(c * ray[0, :2] / ray[0, 2])
         principal = np.array([(cols - 1) / 2, (rows - 1) / 2]) - np.mean(middles, axis=0)
-        assert np.allclose(Rotation.from_matrix(turns[0]).as_matrix(), turns[0])
         shift = float((new @ base)[1 if upright else 0])
         return Rectification(self, turns, c, (float(principal[0]), float(principal[1])), (cols, rows), shift, upright)
 
@@ -191,15 +186,10 @@ def camera_pair(calibration: Calibration | StoredCalibration, first: str | None 
     if rig is None or not rig.cameras:
         remedy = "calibrate them together: `rig: names` in the project, or --rig"
         raise InputError("the calibration has no rig", allowed="cameras with images of one instant", remedy=remedy)
-    root = rig.cameras[0].reference
-    turns, places = {root: np.eye(3)}, {root: np.zeros(3)}
-    for one in rig.cameras:
-        if one.reference == root:
-            turns[one.camera], places[one.camera] = one.rotation, one.position
-    names = first or root, second or next(name for name in turns if name != (first or root))
-    wrong = next((name for name in names if name not in turns), None)
-    if wrong is not None or names[0] == names[1]:
-        raise InputError("not two cameras of the rig", value=f"{names[0]}, {names[1]}", allowed=", ".join(turns))
-    a, b = names
-    R = turns[b] @ turns[a].T
-    return CameraPair(models[a], models[b], R, turns[b] @ (places[a] - places[b]))
+    frames = rig.frames()
+    a = first or next(iter(frames))
+    b = second or next(name for name in frames if name != a)
+    if a == b or not {a, b} <= set(frames):
+        raise InputError("not two cameras of the rig", value=f"{a}, {b}", allowed=", ".join(frames))
+    (turn, place), (other_turn, other_place) = frames[a], frames[b]
+    return CameraPair(models[a], models[b], other_turn @ turn.T, other_turn @ (place - other_place))

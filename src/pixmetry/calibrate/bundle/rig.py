@@ -161,6 +161,14 @@ def rigid(rig: Rig, state: State) -> State:
     return rig.posed(Frames(R, d, turned, at / count), state)
 
 
+def largest_turn(rig: Rig, state: State) -> tuple[float, int]:
+    """Largest angle between an image as it stands and as the rig of `rigid` has it, degrees, and which image that is."""
+    turn = np.swapaxes(rigid(rig, state).rotation[rig.image], 1, 2) @ state.rotation[rig.image]
+    angle = np.arccos(np.clip((np.trace(turn, axis1=1, axis2=2) - 1) / 2, -1.0, 1.0))
+    worst = int(np.argmax(angle))
+    return float(np.rad2deg(angle[worst])), int(rig.image[worst])
+
+
 def _nearest_rotation(matrix: Array) -> Array:
     left, _, right = np.linalg.svd(matrix)
     turned: Array = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right

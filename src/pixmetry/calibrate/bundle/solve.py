@@ -9,6 +9,7 @@ import numpy as np
 from pixmetry.calibrate.bundle.model import NAMES
 from pixmetry.calibrate.bundle.network import PER_IMAGE_NAMES, Adjustment, Network, State
 from pixmetry.calibrate.bundle.options import Options
+from pixmetry.calibrate.bundle.rig import largest_turn, rig_of
 from pixmetry.calibrate.bundle.settling import Progress, Settled, adjust_with, settle
 from pixmetry.calibrate.checks.hold_out import LeftOut
 from pixmetry.calibrate.records import Calibration, EccentricityRecord, FieldTest, HoldOut, Tests
@@ -20,6 +21,7 @@ __all__ = ["Options", "calibrate_network"]
 DEFAULTS = Options()
 FEW = ("c", "k1")  # estimated first where start values are rough
 UNTESTED_FIELD = "a test field that is not as it is said to be, which was not tested (options: folds, field)"
+LEAST_TURN_DEG = 2.0  # of an image against its rig, from which the rig is why there is no result
 SIZED = 1.25  # by which lengths may differ from those of the start poses where these gave the size
 
 
@@ -61,7 +63,7 @@ def calibrate_network(
     measured = _as_asked(network, options)
     say("checking the network")
     findings = list(check_network(measured))
-    settled = _from_start(measured, start, options, say)
+    settled = _of_rig(measured, start, options, say)
     settled, field, held, left, more = _checked_field(settled, options, say)
     say("testing the result")
     stated = with_shared_errors(settled.adjustment, a_priori=options.a_priori) if options.shared_errors else settled.adjustment
@@ -91,6 +93,35 @@ def _no_scale(network: Network, adjustment: Adjustment) -> list[Finding]:
     elif np.isfinite(network.u_xyz).any():
         text = f"the known coordinates do not give the scale of the object: lengths are not in {network.unit}"
     return [Finding("no_scale", text, "give a scale bar, or the coordinates of two points", "warning")]
+
+
+def _of_rig(network: Network, start: State | None, options: Options, say: Progress) -> Settled:
+    """A settled adjustment; where cameras that stand still against each other are why there is none, say so."""
+    try:
+        return _from_start(network, start, options, say)
+    except MeasureError as error:
+        if network.instant is None:
+            raise
+        say("adjusting each image with a pose of its own")
+        try:
+            alone = _from_start(replace(network, instant=None), start, options, say).adjustment.state
+        except MeasureError:
+            raise error from None  # the reason is another
+        rig = rig_of(network, alone.posed)
+        if rig is None:
+            raise
+        turn_deg, image = largest_turn(rig, alone)
+        if turn_deg < LEAST_TURN_DEG:
+            raise
+    what = (
+        "the images fit when each has a pose of its own, but not cameras that stand still against each other: "
+        f"{network.images[image]} is turned by {turn_deg:.0f}° against its rig"
+    )
+    remedy = (
+        "check which images were taken at the same instant; a board that looks the same after half a turn must be numbered alike in all "
+        "cameras: use one with a mark"
+    )
+    raise MeasureError(what, where="rig", remedy=remedy)
 
 
 def _from_start(network: Network, start: State | None, options: Options, say: Progress) -> Settled:

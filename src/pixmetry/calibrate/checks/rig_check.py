@@ -35,7 +35,9 @@ def rig_record(adjustment: Adjustment) -> RigRecord | None:
     taken = np.unique(adjustment.network.instant[adjustment.state.posed], return_counts=True)
     instants = int(((taken[1] > 1) & (taken[0] >= 0)).sum())
     taking = {adjustment.network.cameras[k].name for k in adjustment.network.camera_of[adjustment.state.posed]}
-    unjoined = tuple(sorted(taking - {*poses.cameras, *poses.reference[:1]}))
+    root = poses.reference[0]
+    joined = {root, *(name for name, reference in zip(poses.cameras, poses.reference, strict=True) if reference == root)}
+    unjoined = tuple(sorted(taking - joined))
     return RigRecord(
         instants=instants,
         unit=adjustment.network.unit,
@@ -229,7 +231,7 @@ def rig_findings(record: RigRecord | None, *, instants_given: bool) -> list[Find
         return [Finding("rig", text, "Check which images were taken at the same instant.", "warning")]
     out = []
     if record.unjoined:
-        text = f"Cameras that share no instant with {record.cameras[0].reference}: {', '.join(record.unjoined)}."
+        text = f"No chain of common instants joins these cameras to {record.cameras[0].reference}: {', '.join(record.unjoined)}."
         out.append(Finding("rig", text, "Take images of them together, or calibrate them alone.", "warning"))
     test = record.rigid
     if test is not None and test.p < RARE and (test.scatter > FAR * test.expected or test.scatter_deg > FAR * test.expected_deg):

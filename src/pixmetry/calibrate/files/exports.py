@@ -20,9 +20,11 @@ from typing import Any
 import numpy as np
 
 from pixmetry import __version__
-from pixmetry.calibrate.bundle.model import CameraModel
+from pixmetry.calibrate.bundle.model import NAMES, CameraModel
 from pixmetry.calibrate.exchange import (
     EXACT_PX,
+    OPENCV,
+    RATIONAL,
     STORAGES,
     Converted,
     colmap_line,
@@ -102,7 +104,7 @@ def ros_text(model: CameraModel, may_lose_px: float) -> str:
     form = opencv_form(model, may_lose_px)
     d = form["distortion_coefficients"]
     if len(d) == 12:
-        form = opencv_form(held(model, ("c", "xp", "yp", "b1", "p1", "p2", "k1", "k2", "k3", "d1", "d2", "d3"), may_lose_px, "ROS"))
+        form = opencv_form(held(model, RATIONAL, may_lose_px, "ROS"))
         d = form["distortion_coefficients"]
     kind = "equidistant" if form["fisheye"] else "rational_polynomial" if len(d) == 8 else "plumb_bob"
     K = form["camera_matrix"]
@@ -123,14 +125,14 @@ def ros_text(model: CameraModel, may_lose_px: float) -> str:
 def kalibr_text(models: Sequence[CameraModel], may_lose_px: float, rig: RigRecord | None) -> str:
     """A camchain.yaml of Kalibr: pinhole with radtan or equidistant; T_cn_cnm1 in metres where the cameras are a rig."""
     lines = [f"# Written by {BY}"]
-    frames = {} if rig is None else _frames(rig)
+    frames = {} if rig is None else rig.frames()
     metre = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "um": 1e-6, "inch": 0.0254}
     for k, model in enumerate(models):
         fisheye = model.projection != "perspective"
         form = held(model, EQUIDISTANT if fisheye else RADTAN, may_lose_px, "Kalibr", "equidistant" if fisheye else "perspective")
         fx, _, fy, cx, cy = vision_values(form)
         names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p2", "p1")
-        others = [i for i in range(len(models)) if i != k] if frames else []
+        others = [i for i, other in enumerate(models) if i != k and {model.name, other.name} <= set(frames)]
         lines += [
             f"cam{k}:  # {_word(model.name)}",
             "  camera_model: pinhole",
@@ -149,15 +151,6 @@ def kalibr_text(models: Sequence[CameraModel], may_lose_px: float, rig: RigRecor
     return "\n".join(lines) + "\n"
 
 
-def _frames(rig: RigRecord) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Rotation and place of each camera in the frame of the first."""
-    if not rig.cameras:
-        return {}
-    root = rig.cameras[0].reference
-    out = {root: (np.eye(3), np.zeros(3))}
-    return out | {one.camera: (one.rotation, one.position) for one in rig.cameras if one.reference == root}
-
-
 def mrcal_text(model: CameraModel, may_lose_px: float, rig: RigRecord | None) -> str:
     """A .cameramodel of mrcal: LENSMODEL_OPENCV5, 8 or 12, or LENSMODEL_STEREOGRAPHIC; the reference is the rig's first camera."""
     from scipy.spatial.transform import Rotation
@@ -174,7 +167,7 @@ def mrcal_text(model: CameraModel, may_lose_px: float, rig: RigRecord | None) ->
         allowed = "perspective or stereographic"
         raise InputError(f"mrcal has no place for a fisheye ({model.projection})", where=model.name, allowed=allowed, remedy="take another")
     turn, shift = np.zeros(3), np.zeros(3)
-    if rig is not None and model.name in (frames := _frames(rig)):
+    if rig is not None and model.name in (frames := rig.frames()):
         R, d = frames[model.name]
         turn, shift = Rotation.from_matrix(R).as_rotvec(), -R @ d
     return (
@@ -365,6 +358,8 @@ def _found(name: str, model: CameraModel) -> Converted:
     """The model as a format holds it."""
     fisheye = model.projection != "perspective"
     names: dict[str, Any] = {"kalibr": EQUIDISTANT if fisheye else RADTAN, "metashape": METASHAPE, "matlab": MATLAB}
+    if name == "ros" and not fisheye:
+        names["ros"] = RATIONAL if any(v for n, v in zip(NAMES, model.values, strict=True) if n[0] in "ds") else OPENCV
     if name == "mrcal" and model.projection == "stereographic":
         return converted(model, "object_to_image", ("c", "xp", "yp", "b1"), "stereographic")
     if fisheye:

@@ -333,4 +333,5 @@ def cameras_text(calibration: Calibration | LineCalibration, report: str = "") -
         record, names = json.loads(lines_json(calibration)), ("schema", "cameras", "axes", "f_test", "findings")
     else:
         record = _record(calibration)
-    return json_text({**{name: record[name] for name in names}, "report": report or None}).rstrip("\n")
+    rig = {"rig": record["tests"]["rig"]} if record.get("tests", {}).get("rig") else {}
+    return json_text({**{name: record[name] for name in names}, **rig, "report": report or None}).rstrip("\n")

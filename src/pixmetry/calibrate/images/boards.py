@@ -45,7 +45,7 @@ class PrintedBoard:
 
     def coordinates_csv(self) -> str:
         """Nominal coordinates as a table that a project's ``points`` reads."""
-        rows = [f"{name},{x:.6g},{y:.6g},0" for name, (x, y) in self.points.items()]
+        rows = [f"{name},{x:.9g},{y:.9g},0" for name, (x, y) in self.points.items()]
         return "\n".join(["# pixmetry board: nominal coordinates of the print; measure its pitch", "point,X_mm,Y_mm,Z_mm", *rows]) + "\n"
 
     def drawn(self, form: str) -> bytes:
@@ -149,11 +149,11 @@ def board_of(
     points, black, discs = draw(cols, rows, pitch_mm, diameter if kind == "dots" else side, words)
     solid = np.concatenate([black, np.column_stack([discs[:, :2] - discs[:, 2:], 2 * discs[:, 2:], 2 * discs[:, 2:]])])
     low, high = solid[:, :2].min(axis=0) - MARGIN * pitch_mm, (solid[:, :2] + solid[:, 2:]).max(axis=0) + MARGIN * pitch_mm
-    more = f" --diameter-mm {diameter:g}" if kind == "dots" else f" --side-mm {side:g}" if kind in shares else ""
+    more = f" --diameter-mm {diameter:.9g}" if kind == "dots" else f" --side-mm {side:.9g}" if kind in shares else ""
     more += f" --dictionary {words}" if kind in DICTIONARY else ""
-    options = f"--kind {kind} --grid {cols}x{rows} --pitch-mm {pitch_mm:g}{more}"
+    options = f"--kind {kind} --grid {cols}x{rows} --pitch-mm {pitch_mm:.9g}{more}"
     return PrintedBoard(
-        f"{kind}, {cols} × {rows}, pitch {pitch_mm:g} mm", options, points, black, discs, (*low.tolist(), *(high - low).tolist())
+        f"{kind}, {cols} × {rows}, pitch {pitch_mm:.9g} mm", options, points, black, discs, (*low.tolist(), *(high - low).tolist())
     )
 
 

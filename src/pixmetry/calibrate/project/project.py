@@ -28,7 +28,7 @@ from pixmetry.calibrate.project.straight_lines import LinePositions, lines_of_pi
 from pixmetry.calibrate.project.tables import Table, first_few
 from pixmetry.camera.camera import Camera
 from pixmetry.core.config import Settings, load_yaml, validate
-from pixmetry.core.errors import InputError
+from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.finding import Finding
 from pixmetry.core.progress import Progress
 
@@ -335,7 +335,12 @@ def _located(
     parts = []
     for one in told:
         files = reader.pictures(wanted.files[one.model.name], wanted.raw)
-        parts.append(_locate_targets(wanted, files, one.model, None, progress, one.check))
+        try:
+            part = _locate_targets(wanted, files, one.model, None, progress, one.check)
+        except MeasureError as error:
+            error.where = f"{error.where} of {one.model.name}"
+            raise
+        parts.append((*part[:3], tuple(replace(said, text=f"{one.model.name}: {said.text}") for said in part[3])))
     names = [name for _, seen, _, _ in parts for name in seen.images]
     own = [f"{camera.name}/" if len(set(names)) < len(names) else "" for camera, _, _, _ in parts]
     images_of = tuple(f"{head}{name}" for head, (_, seen, _, _) in zip(own, parts, strict=True) for name in seen.images)
