@@ -358,7 +358,8 @@ def test_a_camera_of_which_nothing_is_estimated(simulated: Simulated, tmp_path: 
     record = json.loads((tmp_path / "r" / "calibration.json").read_text())
     (camera,) = record["cameras"]
     assert all(p["u"] == 0 and not p["free"] for p in camera["parameters"]) and camera["covariance"]["names"] == []
-    assert np.allclose([p["value"] for p in camera["parameters"]], simulated.truth.interior[0], rtol=1e-9)
+    told = {p["name"]: p["value"] for p in camera["parameters"]}
+    assert np.allclose([told.get(name, 0.0) for name in NAMES], simulated.truth.interior[0], rtol=1e-9)
     page = words_of(tmp_path / "r" / "report.html")
     assert page.count("held fixed") == len(keys) + 3 and "in the corners" not in page and "Correlations" not in page
 
@@ -538,9 +539,8 @@ def test_a_field_that_fits_no_camera_is_not_calibrated(tmp_path: Path, rng: np.r
     whole = chessboard(7, 6)
     for k, (roll, *tilt) in enumerate([(0, 25, 0), (90, -25, 5), (10, 0, 25), (100, 5, -25), (45, 20, 20), (0, -20, 15)]):
         view = View((3.0, 2.5), 14.0, roll, *tilt)
-        phase = rng.uniform(0, 2 * np.pi)
 
-        def bent(x: np.ndarray, y: np.ndarray, phase: float = phase) -> np.ndarray:
+        def bent(x: np.ndarray, y: np.ndarray, phase: float = 2.4 * k) -> np.ndarray:
             return whole(x + 0.08 * np.sin(1.9 * y + phase), y + 0.08 * np.sin(1.7 * x - phase))
 
         (tmp_path / f"{k}.png").write_bytes(imagecodecs.png_encode(view.frame(bent, rng)))

@@ -29,7 +29,7 @@ from pixmetry.calibrate.records import (
 from pixmetry.core.arrays import Array
 from pixmetry.core.finding import LEVELS, Finding
 
-MISFIT_PX, MISFIT_U = 1.0, 20.0  # rms of residuals, and over the stated uncertainty, from which both say that nothing was calibrated
+MISFIT_PX, MISFIT_U = 1.0, 6.0  # rms of residuals, and over the stated uncertainty, from which both say that nothing was calibrated
 MISFIT_LOST = 0.3  # share of the image coordinates left out that says so
 ORDER = (  # of kinds, among findings of the same level; what is not named here comes between the two parts
     "misfit",
