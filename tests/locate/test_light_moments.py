@@ -121,6 +121,17 @@ def test_two_lobes_are_one_beam_and_two_beams_are_two(rng: np.random.Generator) 
         assert (found["estimator"][0] == "d4sigma") is chosen
 
 
+def test_a_field_of_large_spots_is_no_row_of_beams(rng: np.random.Generator) -> None:
+    """Apertures of beams would reach over the neighbours: each spot is fitted by its template, and none is lost."""
+    y, x = np.mgrid[:200, :240].astype(float)
+    places = np.stack(np.meshgrid(np.arange(24.0, 220, 38), np.arange(24.0, 190, 38)), axis=-1).reshape(-1, 2) + rng.uniform(-1, 1, (30, 2))
+    light = sum(np.exp(-((x - a) ** 2 + (y - b) ** 2) / (2 * 4.5**2)) for a, b in places)
+    found = locate(camera(light, rng, height_dn=400.0), kind="spot")
+    assert len(found) == 30 and "d4sigma_major_px" not in found.columns
+    away = np.hypot(found.x_px[:, None] - places[:, 0], found.y_px[:, None] - places[:, 1]).min(axis=1)
+    assert away.max() < 0.5
+
+
 def test_the_noise_of_a_smooth_frame_is_told_from_its_second_differences(rng: np.random.Generator) -> None:
     """Read noise, black's photons and rounding to 6 %, shot noise to 40 % (some hundred pixels are bright)."""
     frame = camera(beam("gauss", (100.0, 75.0), (25.0, 20.0), 0.0)[0], rng)

@@ -29,6 +29,8 @@ ROWS = {
 D4SIGMA, BLOB = "d4sigma", "light_centroid"
 D4SIGMA_TEXT = "first and second moments in three times the width (ISO 11146): centroid, two widths, azimuth and ellipticity of a beam"
 BLOB_TEXT = "centroid of the light of a region of any shape"
+MOST_LOBES = 6  # regions of one beam, or of a few: more may be a field of spots
+LOBES_APART, BEAMS_APART = 3.0, 10.0  # distances, over half the width at half height: of the lobes of one beam; of apertures of two
 BEAM_PX, BEAM_RATIO = 4.0, 0.8  # half the width of spots at half height from which, ratio of their axes below which they are beams
 SPOTS = ("disc", "ellipse", "ring", "spot")
 FEW_ELECTRONS = 50.0  # at a target's peak: below, the errors of a grey value are visibly no normal ones
@@ -91,11 +93,21 @@ def seen_shape(kind: str, targets: Targets) -> tuple[str, str]:
 
 
 def are_beams(targets: Targets) -> bool:
-    """Whether spots are beams of light, whose widths and azimuth are asked for, and no blurred points: large, or longer than wide."""
+    """Whether spots are beams of light, whose widths and azimuth are asked for, and no blurred points: large, or longer than wide.
+
+    Many that stand apart, but not as far as the apertures of beams reach, are a field of spots.
+    """
+    from scipy.spatial import cKDTree
+
     if not len(targets):
         return False
     strong = np.abs(targets.amplitude_dn) >= 0.2 * np.abs(targets.amplitude_dn).max()
     major, minor = float(np.median(targets.semi_major_px[strong])), float(np.median(targets.semi_minor_px[strong]))
+    if np.count_nonzero(strong) > MOST_LOBES:
+        place = np.stack([targets.x_px, targets.y_px], axis=1)[strong]
+        nearest = float(np.median(cKDTree(place).query(place, 2)[0][:, 1]))
+        if LOBES_APART * major < nearest < BEAMS_APART * major:
+            return False
     return minor > BEAM_PX or (minor < BEAM_RATIO * major and minor > LARGE_PX)
 
 
