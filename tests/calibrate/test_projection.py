@@ -80,6 +80,20 @@ def test_calibrations_of_one_camera_differ_as_their_uncertainties_say(rng):
     assert chi2.sf(statistic, dof) > RATE and chi2.cdf(statistic, dof) > RATE and dof == 100
 
 
+def test_few_degrees_of_freedom_are_not_taken_for_many(rng):
+    """k1 with a variance of 4 degrees of freedom against its truth, 200 times: p is uniform (Fisher's sum); by χ² it would be small."""
+    truth, n, u, dof = _camera("object_to_image"), 200, 1e-5, 4
+    exact = CalibratedCamera(truth.model, (), np.zeros((0, 0)))
+    stat = as_exact = 0.0
+    for _ in range(n):
+        model = truth.model.with_values(k1=truth.model["k1"] + u * rng.standard_normal())
+        found = CalibratedCamera(model, ("k1",), np.array([[u**2 * rng.chisquare(dof) / dof]]), dof=dof)
+        stat += -2 * np.log(difference(found, exact, 9, 7, rotate=False).p)
+        as_exact += -2 * np.log(difference(replace(found, dof=np.inf), exact, 9, 7, rotate=False).p)
+    assert chi2.sf(stat, 2 * n) > RATE and chi2.cdf(stat, 2 * n) > RATE
+    assert as_exact > 1.2 * stat
+
+
 def test_a_rotation_of_the_camera_is_no_difference():
     """Another principal point is nearly a rotation: what is left of 2 px is small; without taking it out, it is 2 px."""
     camera = _camera()
@@ -104,6 +118,7 @@ def test_a_stored_calibration_gives_the_same_cameras(rng, tmp_path):
     found = Calibration(adjust(simulated.network, disturbed(rng, simulated), redundancy=True))
     own = calibrated_cameras(found)["camera"]
     assert own.names == found.adjustment.interior_covariance()[0]
+    assert own.dof == found.adjustment.dof
     np.testing.assert_array_equal(own.unpack(own.pack()).model.values, own.model.values)
 
 
@@ -138,4 +153,5 @@ def test_a_calibration_is_solved_again_with_a_change(rng, tmp_path):
         solve_again(first, without=("nobody",))
     write_results(first, tmp_path / "r")
     stored = calibrated_cameras(read_calibration(tmp_path / "r"))["camera"]
-    assert difference(stored, calibrated_cameras(first)["camera"]).rms_px < 1e-9
+    again = calibrated_cameras(first)["camera"]
+    assert difference(stored, again).rms_px < 1e-9 and stored.dof == pytest.approx(again.dof)

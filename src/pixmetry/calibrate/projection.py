@@ -70,11 +70,14 @@ class CalibratedCamera:
     names : tuple of str
         Estimated parameters.
     covariance : ndarray, shape (k, k)
+    dof : float
+        Degrees of freedom of the covariance, in the mean of the parameters; infinite: it is exact.
     """
 
     model: CameraModel
     names: tuple[str, ...]
     covariance: Array
+    dof: float = np.inf
 
     def pack(self) -> Array:
         """Values of the estimated parameters, shape (k,), in the order of ``names`` and of ``covariance``."""
@@ -161,11 +164,16 @@ def calibrated_cameras(calibration: Calibration | StoredCalibration) -> dict[str
     from pixmetry.calibrate.files.record import StoredCalibration
 
     if isinstance(calibration, StoredCalibration):
-        models, of = calibration.cameras, calibration.interior_covariance
+        told: StoredCalibration | Adjustment = calibration
+        models = calibration.cameras
     else:
-        adjusted = calibration.adjustment
-        models, of = tuple(adjusted.camera(k) for k in range(len(adjusted.network.cameras))), adjusted.interior_covariance
-    return {model.name: CalibratedCamera(model, *of(k)) for k, model in enumerate(models)}
+        told = calibration.adjustment
+        models = tuple(told.camera(k) for k in range(len(told.network.cameras)))
+    found = {}
+    for k, model in enumerate(models):
+        names, covariance = told.interior_covariance(k)
+        found[model.name] = CalibratedCamera(model, names, covariance, float(np.mean(told.interior_dof(k))) if names else np.inf)
+    return found
 
 
 @dataclass(frozen=True)
@@ -188,6 +196,7 @@ class Difference:
     dof : int
         Of the shifts that both covariances can explain.
     p : float
+        Of a difference so large by chance: by an F-test, where the covariances have finite degrees of freedom.
     """
 
     x_px: Array
@@ -219,8 +228,8 @@ def difference(first: CalibratedCamera, second: CalibratedCamera, cols: int = 25
     InputError
         If the frames have different sizes, or the lenses have no inverse in most of the frame.
     """
+    from scipy import stats
     from scipy.spatial.transform import Rotation
-    from scipy.stats import chi2
 
     sensor, other = first.model.sensor, second.model.sensor
     if (sensor.cols, sensor.rows) != (other.cols, other.rows):
@@ -248,13 +257,15 @@ def difference(first: CalibratedCamera, second: CalibratedCamera, cols: int = 25
     rank = int((singular > RANK * singular.max(initial=0.0)).sum()) if roots.size else 0
     rank = min(rank, max(len(first.names), len(second.names)))  # what one lens can differ in; the rest is of second order
     statistic = float((((left[:, :rank].T @ shift.ravel()) / singular[:rank]) ** 2).sum())
+    known = _dof(first, second, roots)
+    p = float(stats.f.sf(statistic / rank, rank, known) if np.isfinite(known) else stats.chi2.sf(statistic, rank)) if rank else float("nan")
     shifts, u_shifts = np.full((rows * cols, 2), np.nan), np.full((rows * cols, 2), np.nan)
     shifts[good], u_shifts[good] = shift, np.sqrt((roots**2).sum(axis=1)).reshape(-1, 2)
     return Difference(
         x, y, shifts.reshape(rows, cols, 2), u_shifts.reshape(rows, cols, 2), turn,
         rms_px=float(np.sqrt((shift**2).sum(axis=1).mean())),
         expected_rms_px=float(np.sqrt((u_shifts[good] ** 2).sum(axis=1).mean())),
-        chi2=statistic, dof=rank, p=float(chi2.sf(statistic, rank)) if rank else float("nan"),
+        chi2=statistic, dof=rank, p=p,
     )  # fmt: skip
 
 
@@ -277,6 +288,14 @@ def _root(first: CalibratedCamera, second: CalibratedCamera, ray: Array, turn: A
     by_second = second.model.projected(w[:, 0], w[:, 1])[3][:, :, second._places]
     parts = [(by_first, first.covariance), (by_second, second.covariance)]
     return np.hstack([slopes.reshape(2 * len(ray), -1) @ _factor(covariance) for slopes, covariance in parts])
+
+
+def _dof(first: CalibratedCamera, second: CalibratedCamera, roots: Array) -> float:
+    """Degrees of freedom of both covariances together, by their shares in the variance of the shifts (Satterthwaite)."""
+    k = len(first.names)
+    own, other = float((roots[:, :k] ** 2).sum()), float((roots[:, k:] ** 2).sum())
+    doubt = own**2 / first.dof + other**2 / second.dof
+    return (own + other) ** 2 / doubt if doubt > 0 else np.inf
 
 
 def _factor(covariance: Array) -> Array:
