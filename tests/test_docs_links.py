@@ -12,7 +12,8 @@ import pixmetry
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS = ROOT / "docs"
-PAGES = sorted(p for p in [*ROOT.glob("*.md"), *DOCS.rglob("*.md")] if p.name != "0000-template.md")
+SOURCES = DOCS / "gallery"  # of pages of the handbook, whose links are those of the pages
+PAGES = sorted(p for p in [*ROOT.glob("*.md"), *DOCS.rglob("*.md")] if p.name != "0000-template.md" and SOURCES not in p.parents)
 GLOSSARY = DOCS / "glossary.md"
 FENCED = re.compile(r"^```.*?^```", re.M | re.S)
 LINK = re.compile(r"\]\(([^)\s]+)\)|<img src=\"([^\"]+)\"")
