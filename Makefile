@@ -13,7 +13,7 @@ INSTALLED := $(VENV)/.installed
 ORACLES := .venv-oracles
 # BLAS threads beside JOBS processes would only wait for each other.
 PYTEST := OPENBLAS_NUM_THREADS=1 $(PY) -m pytest -n $(JOBS) --dist loadfile --hypothesis-seed=0
-QUICK := $(PYTEST) -m "not browser and not oracle"
+QUICK := $(PYTEST) -m "not browser and not oracle" --durations=15 --durations-min=5
 
 .DEFAULT_GOAL := help
 .PHONY: help install demo test flaky oracles study bench mutants handbook docs lint browser-test
