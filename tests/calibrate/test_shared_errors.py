@@ -24,7 +24,9 @@ from pixmetry.calibrate.bundle.solve import Options, calibrate_network
 from pixmetry.calibrate.checks.check_points import joint_covariance
 from pixmetry.calibrate.checks.hold_out import subset
 from pixmetry.calibrate.checks.parts import halves_of
+from pixmetry.calibrate.page.page import page_of
 from pixmetry.calibrate.records import Tests, read_record, record_of
+from pixmetry.report import html_of
 
 RATE = 1e-6
 
@@ -251,3 +253,16 @@ def test_degrees_of_freedom_are_those_of_the_adjustment_without_a_search(rng):
     one = adjust(simulated.network, disturbed(rng, simulated, 0.003))
     assert one.shared is None and (one.interior_dof() == one.dof).all()
     assert isinstance(with_shared_errors(one).shared, SharedErrors)
+
+
+def test_shared_errors_of_a_camera_that_is_held_are_told_without_its_parameters(rng):
+    """Found, and said in finding and page, but no u of a parameter there is: no factor and no table of them."""
+    simulated = simulate(rng, images=12, points=50, bars=0)
+    bent = bent_by_image(rng, simulated, 0.3)
+    camera = replace(bent.cameras[0], values=simulated.truth.interior[0].copy(), free=np.zeros_like(bent.cameras[0].free))
+    found = calibrate_network(replace(bent, cameras=(camera,)), Options(folds=0, snoop=False))
+    assert found.adjustment.shared.found and found.tests.shared_errors["camera"].names == ()
+    (said,) = [one.text for one in found.findings if one.kind == "shared_errors"]
+    assert said.endswith("The stated uncertainties hold them.")
+    page = html_of(page_of(found))
+    assert "The uncertainties of poses and points hold them." in page and "u / u independent" not in page

@@ -142,13 +142,16 @@ def shared_findings(found: Mapping[str, SharedByCamera]) -> list[Finding]:
         if not one.found:
             continue
         parts = [f"{size:.3f} px {words[kind]}" for kind, size in zip(one.kinds, one.rms_px, strict=True) if size >= 5e-4]
-        low, high = plain(float(one.widened.min(initial=np.inf)), 2), plain(float(one.widened.max(initial=0.0)), 2)
-        dof = max(1.0, float(np.median(one.dof)))
         text = (
             f"{camera}: image points have errors in common ({', '.join(parts)}; independent: {one.independent_px:.3f} px). The stated "
-            f"uncertainties hold them: they are {low} to {high} times those of independent errors, with about {dof:.0f} degrees of freedom "
-            f"(95 %: ± {stats.t.ppf(0.975, dof):.2g} u)."
+            "uncertainties hold them"
         )
+        if one.names:
+            low, high = plain(float(one.widened.min()), 2), plain(float(one.widened.max()), 2)
+            dof = max(1.0, float(np.median(one.dof)))
+            text += f": they are {low} to {high} times those of independent errors, with about {dof:.0f} degrees of freedom "
+            text += f"(95 %: ± {stats.t.ppf(0.975, dof):.2g} u)"
+        text += "."
         advice = "More points per image do not help. Remove the causes that the residuals show, or take more images from other directions."
         out.append(Finding("shared_errors", text, advice, "note"))
     return out

@@ -196,6 +196,8 @@ def _uncertainties(own: Section, calibration: Calibration, shared: SharedByCamer
     part.add_text(typeset(shared_text(shared)))
     if halves:
         part.add_text(typeset(halves_text(halves)))
+    if not shared.names:
+        return
     heads, rows = tables.uncertainties(shared, halves or (), left)
     part.add(number_table(f"Uncertainties of {name}", heads, rows))
     part.add_text(UNCERTAINTIES + (f" {LEFT_OUT.format(folds=left.folds)}" if left else ""), style="small soft")

@@ -164,11 +164,11 @@ def shared_text(shared: SharedByCamera) -> str:
     if not shared.found:
         return "The residuals show no errors that image points have in common: u is that of independent errors."
     parts = [f"{size:.3f}{NO_BREAK}px {SHARED[kind]}" for kind, size in zip(shared.kinds, shared.rms_px, strict=True) if size >= 5e-4]
+    text = f"Image points have errors in common: {', '.join(parts)}; {shared.independent_px:.3f}{NO_BREAK}px are independent."
+    if not shared.names:
+        return f"{text} The uncertainties of poses and points hold them."
     low, high = (f"{one:.1f}" for one in (shared.widened.min(), shared.widened.max()))
-    return (
-        f"Image points have errors in common: {', '.join(parts)}; {shared.independent_px:.3f}{NO_BREAK}px are independent. u holds them: "
-        f"it is {low} to {high} times that of independent errors."
-    )
+    return f"{text} u holds them: it is {low} to {high} times that of independent errors."
 
 
 def sigma0_text(calibration: Calibration) -> str:
