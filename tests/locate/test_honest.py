@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from locate import honest_cases
+from locate import honest_cases, rendered
 from locate.coverage_cells import Case
 from locate.honest_cases import Picture
 from pixmetry.locate.job import locate
@@ -39,6 +39,18 @@ def test_noise_that_is_not_white_is_in_the_uncertainty(exposure, axis: str, rng:
     z = {"both": score.z, "x": score.z[: SIDE**2], "y": score.z[SIDE**2 :]}[axis]
     low, high = bounds(len(z))
     assert low < np.sqrt((z**2).mean()) < high
+
+
+def test_offsets_of_rows_that_exceed_the_noise_leave_x_its_own(rng: np.random.Generator) -> None:
+    """An offset that a whole row has in common moves nothing along it: u of x is that of the pixels' own noise."""
+    ratio = []
+    for _ in range(4):
+        mean = rendered.discs_frame(rng, shape=(400, 600), count=110, radii=(5.0, 5.0), amplitude=100.0, background=60.0)[0]
+        found = locate(rendered.expose(mean + rng.normal(0, 3.0, (400, 1)), rng, read_dn=1.5))
+        alone = locate(rendered.expose(mean, rng, read_dn=1.5))
+        ratio.append(np.sqrt(np.median(found.var_x_px2) / np.median(alone.var_x_px2)))
+        assert np.median(found.var_y_px2) > 4 * np.median(found.var_x_px2)
+    assert 0.8 < np.mean(ratio) < 1.25  # 1.02, and 0.04 by chance
 
 
 def test_tilted_discs_whose_noise_is_another_than_that_of_the_ground(rng: np.random.Generator) -> None:

@@ -228,7 +228,10 @@ def spread_of(one: Drawn, noise: NoiseModel, known: Correlation, near_alike: np.
     covariance, pairs = known.over(side)
     lag = np.abs(np.arange(1 - side, side))
     near = np.maximum(lag[:, None], lag) <= NEAR_PX
-    here, around = np.where(near, covariance / known.variance_dn2, 0.0), np.where(near, 0.0, covariance)
+    # the noise model's variance on the ground, and not that of the blocks: what rows share must cancel in x to the last percent
+    variance = float(noise.variance_dn2(np.median(one.mean[[0, -1]])))
+    here = np.where(near, covariance / known.variance_dn2, 0.0)
+    around = np.where(near, 0.0, covariance * variance / known.variance_dn2)
     if near_alike is not None:
         middle = slice(side - 1 - NEAR_PX, side + NEAR_PX)
         here[middle, middle] = near_alike
@@ -242,12 +245,12 @@ def spread_of(one: Drawn, noise: NoiseModel, known: Correlation, near_alike: np.
         factor[k] = 1 + excess
         if k < 2:
             own[side - 1, side - 1] = 0.0
-            by_chance = 2 * np.where(near, own, in_dn * known.variance_dn2) ** 2 / np.maximum(pairs, 1.0)
+            by_chance = 2 * np.where(near, own, in_dn * variance) ** 2 / np.maximum(pairs, 1.0)
             clear = max(clear, abs(excess) * total / np.sqrt(by_chance[pairs > 0].sum()))
     x, y = gain[0], gain[1]
     cross = float((lag_sums(x, y) * here).sum() + (lag_sums(ground[0], ground[1]) * around).sum()) / np.sqrt((x**2).sum() * (y**2).sum())
     if noise.origin == "image":  # what the unknowns take of correlated noise is missing in the residuals that it was measured from
-        taken = float((lag_sums(basis) * (here + around / known.variance_dn2)).sum())
+        taken = float((lag_sums(basis) * (here + around / variance)).sum())
         count = float(one.mask.sum())
         factor *= (count - len(gain)) / max(count - len(gain) - taken, 0.5 * count)
     return Spread(np.maximum(factor, LEAST_FACTOR), cross, clear > CLEAR_SIGMA)
