@@ -70,6 +70,8 @@ def test_regions_of_interest_are_crops(frame: np.ndarray) -> None:
         away = np.hypot(part.x_px - x, part.y_px - y)
         assert np.count_nonzero(away < 2) == 1
         assert away.min() < 2 * u
+    cut = part.left_out.reason == "cut by the border of a region of interest"
+    assert np.hypot(part.left_out.x_px[cut][:, None] - part.x_px, part.left_out.y_px[cut][:, None] - part.y_px).min() > 2  # no row
     assert (part.y_px > 22).all()
     assert (part.y_px < 118).all()
     assert not (part.flags & 1).any()

@@ -14,6 +14,7 @@ from pixmetry.locate.detect.detection import THRESHOLD_SIGMA, Regions, seen_at
 from pixmetry.locate.detect.targets import LeftOut, Targets
 
 SAME_PX = 1.0  # two regions of interest that overlap show one target at places that differ by less
+CUT = "cut by the border of a region of interest"
 NEAR_PX = 3.0  # beyond a target's outline, at which a given place is still its
 
 
@@ -202,7 +203,7 @@ def detect_within(frame: np.ndarray, limits: Limits, look: Callable[[np.ndarray]
         if not whole:
             near = (t.row_first - 2 < top) & (top > 0) | (t.row_stop + 2 > bottom) & (bottom < frame.shape[0])
             near |= (t.col_first - 2 < left) & (left > 0) | (t.col_stop + 2 > right) & (right < frame.shape[1])
-            lost = LeftOut.joined([lost, seen_at(t[near], "cut by the border of a region of interest")])
+            lost = LeftOut.joined([lost, seen_at(t[near], CUT)])
             t = t[~near]
         parts.append(t)
         left_out.append(lost)
@@ -212,4 +213,12 @@ def detect_within(frame: np.ndarray, limits: Limits, look: Callable[[np.ndarray]
 
         pairs = cKDTree(np.column_stack([targets.x_px, targets.y_px])).query_pairs(SAME_PX, output_type="ndarray")
         targets = targets[np.setdiff1d(np.arange(len(targets)), pairs[:, 1])]
-    return targets, LeftOut.joined(left_out), polarities, grounds
+    return targets, _nowhere_whole(LeftOut.joined(left_out), targets), polarities, grounds
+
+
+def _nowhere_whole(lost: LeftOut, targets: Regions) -> LeftOut:
+    """Without what one region of interest cuts and another one shows whole."""
+    x, y = lost.x_px[:, None], lost.y_px[:, None]
+    within = (x >= targets.col_first) & (x < targets.col_stop) & (y >= targets.row_first) & (y < targets.row_stop)
+    keep = (lost.reason != CUT) | ~within.any(axis=1)
+    return LeftOut(**{f.name: getattr(lost, f.name)[keep] for f in fields(LeftOut)})
