@@ -14,6 +14,7 @@ from scipy.stats import chi2
 from calibrate.distances import Pooled
 from calibrate.networks import image_of
 from calibrate.rigs import relative_error, simulated_rig
+from calibrate.test_calibration_images import View, chessboard
 from pixmetry import calibrate, read_calibration
 from pixmetry.calibrate.bundle.bundle import adjust
 from pixmetry.calibrate.bundle.network import State
@@ -324,3 +325,23 @@ def test_the_stereo_pairs_agree_with_opencv(tmp_path):
     turn = np.rad2deg(Rotation.from_matrix(ours.rotation @ R.T).as_rotvec())
     assert np.all(np.abs(turn) < 3 * ours.u_rotation_deg)
     assert np.all(np.abs(ours.position + R.T @ T) < 4 * ours.u_position)
+
+
+def test_one_picture_of_a_held_camera_is_enough(rng, tmp_path):
+    """A camera of which nothing is estimated needs one picture; of another the error says whose pictures are too few."""
+    import imagecodecs
+
+    for side, count in (("left", 1), ("right", 3)):
+        for k in range(count):
+            frame = View((3.0, 2.5), 14.0, 10.0 * k, 20 - 15 * k, 5.0).frame(chessboard(7, 6), rng)
+            (tmp_path / f"{side}{k}.png").write_bytes(imagecodecs.png_encode(frame))
+    text = "schema: pixmetry/calibration/1\ncameras:\n- {name: left, c_px: 600, free: none}\n- {name: right}\nrig: names\n"
+    text += "pictures: {files: {left: 'left*.png', right: 'right*.png'}, kind: chessboard, grid: 7x6, pitch: 10}\n"
+    project = tmp_path / "project.yaml"
+    project.write_text(text)
+    network = load_project(project).network
+    assert network.images == ("left0.png", "right0.png", "right1.png", "right2.png")
+    assert network.instant.tolist() == [0, 0, 1, 2]
+    project.write_text(text.replace(", free: none", ""))
+    with pytest.raises(MeasureError, match="images of left: 1 of 1 images can be used"):
+        load_project(project)

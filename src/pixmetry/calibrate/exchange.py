@@ -143,7 +143,7 @@ def opencv_form(model: CameraModel, tolerance_px: float = 0.0) -> dict[str, Any]
         If more than that would be lost; it says what.
     """
     fisheye = model.projection != "perspective"
-    names = FISHEYE if fisheye else PRISMATIC if _uses(model, "s") else RATIONAL if _uses(model, "d") else OPENCV
+    names = FISHEYE if fisheye else opencv_names(model)
     form = held(model, names, tolerance_px, "OpenCV's fisheye" if fisheye else "OpenCV", "equidistant" if fisheye else "perspective")
     fx, _, fy, cx, cy = vision_values(form)
     return {
@@ -152,6 +152,11 @@ def opencv_form(model: CameraModel, tolerance_px: float = 0.0) -> dict[str, Any]
         "camera_matrix": np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]),
         "distortion_coefficients": np.array([form[name] for name in (FISHEYE[4:] if fisheye else ORDER[: len(names) - 4])]),
     }
+
+
+def opencv_names(model: CameraModel) -> tuple[str, ...]:
+    """Our parameters that the coefficients hold which OpenCV needs for a lens that is no fisheye."""
+    return PRISMATIC if _uses(model, "s") else RATIONAL if _uses(model, "d") else OPENCV
 
 
 def _uses(model: CameraModel, letter: str) -> bool:

@@ -15,12 +15,11 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from pixmetry import __version__
-from pixmetry.calibrate.bundle.model import NAMES, CameraModel
+from pixmetry.calibrate.bundle.model import CameraModel
 from pixmetry.calibrate.exchange import (
     EXACT_PX,
     OPENCV,
@@ -32,6 +31,7 @@ from pixmetry.calibrate.exchange import (
     converted,
     held,
     opencv_form,
+    opencv_names,
     opencv_text,
     vision_values,
 )
@@ -356,15 +356,12 @@ def _places(cameras: list[CameraModel], path: Path) -> list[tuple[Path, list[Cam
 
 def _found(name: str, model: CameraModel) -> Converted:
     """The model as a format holds it."""
-    fisheye = model.projection != "perspective"
-    names: dict[str, Any] = {"kalibr": EQUIDISTANT if fisheye else RADTAN, "metashape": METASHAPE, "matlab": MATLAB}
-    if name == "ros" and not fisheye:
-        names["ros"] = RATIONAL if any(v for n, v in zip(NAMES, model.values, strict=True) if n[0] in "ds") else OPENCV
     if name == "mrcal" and model.projection == "stereographic":
         return converted(model, "object_to_image", ("c", "xp", "yp", "b1"), "stereographic")
-    if fisheye:
-        return converted(model, "object_to_image", names.get(name, EQUIDISTANT), "equidistant")
-    widest = ("c", "xp", "yp", "b1", "p1", "p2", "k1", "k2", "k3", *(n for n, v, *_ in model.parameters if n[0] in "ds" and v))
+    if model.projection != "perspective" and name != "matlab":
+        return converted(model, "object_to_image", METASHAPE if name == "metashape" else EQUIDISTANT, "equidistant")
+    widest = opencv_names(model)
+    names = {"kalibr": RADTAN, "metashape": METASHAPE, "matlab": MATLAB, "ros": OPENCV if widest == OPENCV else RATIONAL}
     return converted(model, "object_to_image", names.get(name, widest), "perspective")
 
 
@@ -373,5 +370,5 @@ def _sentence(name: str, path: Path, model: CameraModel, index: int) -> str:
     what = f"{model.name} as camera {index + 1}, {kind}" if name == "colmap" else f"{model.name} for {FORMATS[name].title}"
     lost = "nothing is lost" if found.largest_px <= EXACT_PX else f"up to {found.largest_px:.2g} px are lost"
     if found.share < 1:
-        lost += f"; in {100 * (1 - found.share):.0f} % of the frame the calibrated lens has no inverse, and nothing can be compared"
+        lost += f"; in {100 * (1 - found.share):.2g} % of the frame the calibrated lens has no inverse, and nothing can be compared"
     return f"{path}: {what}; {lost}"

@@ -307,9 +307,11 @@ def _locate_targets(
     InputError, MeasureError
         If pictures cannot be read, or too few of them show the test field.
     """
-    from pixmetry.calibrate.images.images import observations_of
+    from pixmetry.calibrate.images.images import LEAST_IMAGES, observations_of
 
-    found = observations_of(files, wanted.kind, **wanted.model_dump(exclude={"files", "kind"}), progress=progress)
+    least = LEAST_IMAGES if camera.free.any() else 1  # one image suffices for a pose
+    told = wanted.model_dump(exclude={"files", "kind"})
+    found = observations_of(files, wanted.kind, **told, least_images=least, progress=progress)
     check(found.sizes[0])
     camera_of, time_s, poses = image_facts(images, found.images, [camera], lambda name: name)
     network = found.network(_of_size(camera, *found.sizes[0]))
