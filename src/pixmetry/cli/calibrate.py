@@ -138,7 +138,7 @@ OPTIONS = ("field", "loss", "folds", "residual_grid", "snoop", "a_priori")
     help="Largest error that an export may add anywhere in the frame, px.",
 )
 @pdf_option()
-@json_option("the cameras and the findings")
+@json_option("the cameras, their rig and the findings")
 @click.option("--threads", type=click.IntRange(1), help="Number of threads. Default: one for each processor.")
 def calibrate(
     sources: tuple[Path, ...],
