@@ -12,7 +12,7 @@ from pixmetry.core import compiling
 from pixmetry.core.jit import jit
 from pixmetry.locate.estimators import estimators
 
-WITHOUT_KERNELS = {"sources", "compare", "shoot-list", "series", "warm-up"}  # of their own; those of `locate` serve a series
+WITHOUT_KERNELS = {"sources", "compare", "shoot-list", "series", "init", "board", "warm-up"}  # of their own
 
 
 @pytest.fixture
@@ -48,6 +48,6 @@ def test_warming_up_runs_every_command_and_every_estimator(tmp_path: Path) -> No
     jobs = list(jobs_in(tmp_path))
     assert {name for name, _ in jobs} == set(COMMANDS) - WITHOUT_KERNELS
     asked = {(job.keywords.get("kind", "disc"), job.keywords["estimator"]) for name, job in jobs if name == "locate"}
-    kinds = ("disc", "ellipse", "ring", "spot", "coded", "line", "edge", "cross", "chessboard")
+    kinds = ("disc", "ellipse", "ring", "spot", "coded", "line", "edge", "cross", "chessboard", "blob")
     assert asked >= {(kind, estimator) for kind in kinds for estimator in estimators(kind)}
     assert len(all_kernels()) > 200

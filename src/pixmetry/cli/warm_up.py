@@ -185,9 +185,19 @@ def _locating() -> Iterator[Job]:
         for estimator in estimators(kind):
             for number in TYPES:
                 yield "locate", partial(locate, picture.astype(number), kind=kind, estimator=estimator, **options)
-    few = np.rint(_pictures()["disc"][0] / 8.0)
+    discs = _pictures()["disc"][0]
+    for number in TYPES:
+        yield "locate", partial(_track, discs.astype(number), estimator="soft_threshold")
+    few = np.rint(discs / 8.0)
     for number in TYPES:
         yield "locate", partial(locate, few.astype(number), estimator="poisson_gaussian", noise="read=0.5,gain=1")
+
+
+def _track(picture: np.ndarray, estimator: str) -> None:
+    """Follow the targets of a picture into itself."""
+    from pixmetry import Tracker
+
+    Tracker(picture, estimator=estimator).update(picture)
 
 
 def _pictures() -> dict[str, tuple[np.ndarray, dict[str, Any]]]:
@@ -225,4 +235,5 @@ def _pictures() -> dict[str, tuple[np.ndarray, dict[str, Any]]]:
         "cross": (noisy(across), {}),
         "chessboard": (noisy(board), {"grid": (7, 5)}),
         "coded": (noisy(np.minimum(coded, 1.0)), {}),
+        "blob": (noisy(discs), {}),
     }

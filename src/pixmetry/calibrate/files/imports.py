@@ -34,8 +34,8 @@ def read_cameras(path: str | Path) -> dict[str, CameraModel] | None:
     --------
     >>> text = "{'lensmodel': 'LENSMODEL_PINHOLE', 'intrinsics': [900.0, 905.0, 319.5, 239.5], 'imagersize': [640, 480]}"
     >>> written = Path("a.cameramodel").write_text(text)
-    >>> read_cameras("a.cameramodel")["a"].c_px
-    (905.0, 905.0)
+    >>> [float(c) for c in read_cameras("a.cameramodel")["a"].c_px]
+    [905.0, 905.0]
     """
     source = Path(path)
     ending, text = source.suffix.lower(), read_text(source)

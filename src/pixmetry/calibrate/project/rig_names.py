@@ -106,9 +106,9 @@ def cameras_of_files(files: Sequence[Path]) -> dict[str, list[str]]:
 
     Examples
     --------
-    >>> cameras_of_files([Path("left01.jpg"), Path("left02.jpg"), Path("right01.jpg")])
-    {'left': ['left01.jpg', 'left02.jpg'], 'right': ['right01.jpg']}
-    >>> list(cameras_of_files([Path("a/cam0/17.png"), Path("a/cam1/17.png")]))
+    >>> cameras_of_files([Path("left01.jpg"), Path("left02.jpg"), Path("right01.jpg"), Path("right02.jpg")])
+    {'left': ['left01.jpg', 'left02.jpg'], 'right': ['right01.jpg', 'right02.jpg']}
+    >>> list(cameras_of_files([Path(f"a/cam{k}/{n}.png") for k in (0, 1) for n in (17, 18)]))
     ['cam0', 'cam1']
     """
     spans = [list(NUMBER.finditer(path.stem)) for path in files]
