@@ -195,7 +195,7 @@ def _locating() -> Iterator[Job]:
 
 def _track(picture: np.ndarray, estimator: str) -> None:
     """Follow the targets of a picture into itself."""
-    from pixmetry import Tracker
+    from pixmetry.locate.track.tracker import Tracker
 
     Tracker(picture, estimator=estimator).update(picture)
 
