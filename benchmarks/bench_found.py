@@ -9,6 +9,7 @@ noise, at a stated rate of one a frame and at that of the default.
 from __future__ import annotations
 
 import argparse
+import secrets
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -73,8 +74,10 @@ def scored(places: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--frames", type=int, default=2, help="of each case; ten times as many of noise")
+    parser.add_argument("--seed", type=int, default=secrets.randbits(32), help="draw what the run with this seed drew")
     args = parser.parse_args()
-    rng = np.random.default_rng()
+    print(f"--seed {args.seed} repeats these draws")
+    rng = np.random.default_rng(args.seed)
     peers: dict[str, Callable[[np.ndarray, float, int], tuple[np.ndarray, np.ndarray]]] = {}
     if available("sep"):
         peers |= {"sep 1.5 σ": lambda f, d, n: sep_found(f, 1.5), "sep 3 σ": lambda f, d, n: sep_found(f, 3.0)}

@@ -1,6 +1,6 @@
 """Boards in random difficult views: how many points are found with their right number, and that none has a wrong one.
 
-    python benchmarks/study_boards.py [SECONDS]
+    python benchmarks/study_boards.py [SECONDS [SEED]]
 
 Each board is drawn through a random pinhole view: tilted up to 60°, rolled at will, blurred, cut by the frame, in uneven light, with
 bright and dark clutter over it. A number is wrong if its point lies farther than 0.3 of the pitch from where the board has it, in the
@@ -10,6 +10,7 @@ numbers.
 
 from __future__ import annotations
 
+import secrets
 import sys
 import time
 
@@ -74,8 +75,9 @@ def wrong_numbers(kind: str, places: np.ndarray, named: np.ndarray, grid: tuple[
     return min(int((np.abs(places - way).max(axis=1) > MOST_OFF).sum()) for way in ways)
 
 
-def main(seconds: float) -> None:
-    rng = np.random.default_rng()
+def main(seconds: float, seed: int) -> None:
+    print(f"{seconds:g} {seed} repeats these draws, as far as the time reaches")
+    rng = np.random.default_rng(seed)
     for kind, grid in BOARDS.items():
         board = board_of(kind, grid, 1.0)
         side = {"charuco": 0.75, "aprilgrid": round(10 / 13, 4)}.get(kind)
@@ -98,4 +100,4 @@ def main(seconds: float) -> None:
 
 
 if __name__ == "__main__":
-    main(float(sys.argv[1]) if len(sys.argv) > 1 else 60.0)
+    main(float(sys.argv[1]) if len(sys.argv) > 1 else 60.0, int(sys.argv[2]) if len(sys.argv) > 2 else secrets.randbits(32))
