@@ -26,6 +26,7 @@ FLOORS = (
     ("simulate", "emva", "calibrate", "series"),
     ("budget",),
     ("assess",),
+    ("bench",),
     ("cli",),
     ("__main__",),
 )

@@ -42,6 +42,8 @@ COMMANDS = {
     "series": "Follow a fixed field over time: warm-up of camera and frame grabber, when it is stable.",
     "bound": "Compute how well a target can be located (Cramér–Rao bound), and what limits it.",
     "budget": "Budget every error source of a camera for a measurement, before and after calibration.",
+    "bench": "Open a page to move what a camera is, and to see what it does to a target.",
+    "view": "Look at a result on a page: tables, maps, positions and residuals.",
     "shoot-list": "List the frames to take of a camera: set-ups, counts, charts to print, a manifest to fill in.",
     "correct": "Correct frames for what is known of their camera, measured or described.",
     "corrected": "Correct positions for what is known of their camera's geometry.",

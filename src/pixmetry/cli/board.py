@@ -9,16 +9,24 @@ import click
 
 from pixmetry.cli._console import echo
 
-KINDS = ("chessboard", "dots", "squares", "charuco", "aprilgrid")
+KINDS = ("chessboard", "dots", "asymmetric", "squares", "charuco", "aprilgrid", "coded")
 
 
 @click.command()
 @click.argument("kind", type=click.Choice(KINDS))
-@click.option("--grid", required=True, metavar="COLSxROWS", help="Inner corners, dots, squares or tags; of charuco the squares.")
+@click.option("--grid", required=True, metavar="COLSxROWS", help="Inner corners, dots, squares, tags, coded targets; charuco: squares.")
 @click.option("--pitch-mm", type=click.FloatRange(0, min_open=True), required=True, help="From one to the next, mm.")
 @click.option("--side-mm", type=click.FloatRange(0, min_open=True), help="Side of separate squares, markers or tags, mm.")
-@click.option("--diameter-mm", type=click.FloatRange(0, min_open=True), help="Diameter of the dots, mm. Default: half of the pitch.")
-@click.option("--dictionary", metavar="NAME", help="Of the markers. Default: 5X5_1000; of an aprilgrid APRILTAG_36h11.")
+@click.option(
+    "--diameter-mm",
+    type=click.FloatRange(0, min_open=True),
+    help="Diameter of dots, or of the discs of coded targets, mm. Default: half of the pitch; asymmetric 0.35, coded 0.22 of it.",
+)
+@click.option(
+    "--dictionary",
+    metavar="NAME",
+    help="Of the markers. Default: 5X5_1000; of an aprilgrid APRILTAG_36h11; of coded targets RING_12 (or RING_8, 14, 16, 20).",
+)
 @click.option("-o", "--output", type=click.Path(path_type=Path), required=True, metavar="FILE.pdf|.svg", help="File of the print.")
 def board(
     kind: str, grid: str, pitch_mm: float, side_mm: float | None, diameter_mm: float | None, dictionary: str | None, output: Path

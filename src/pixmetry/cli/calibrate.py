@@ -38,7 +38,7 @@ OPTIONS = ("field", "loss", "folds", "residual_grid", "snoop", "a_priori")
 )
 @click.option("--pitch-mm", type=click.FloatRange(0, min_open=True), help="Spacing of the corners or dots, mm.")
 @click.option("--side-mm", type=click.FloatRange(0, min_open=True), help="Side of separate squares, markers or tags, mm.")
-@click.option("--dictionary", metavar="NAME", help="Of markers, such as 5X5_1000 (charuco) or APRILTAG_36h11 (aprilgrid), the defaults.")
+@click.option("--dictionary", metavar="NAME", help="Of markers. Default: 5X5_1000 (charuco), APRILTAG_36h11 (aprilgrid), RING_12 (coded).")
 @click.option(
     "--diameter-mm",
     type=click.FloatRange(0, min_open=True),
@@ -126,8 +126,8 @@ OPTIONS = ("field", "loss", "folds", "residual_grid", "snoop", "a_priori")
     "exports",
     multiple=True,
     metavar="FORMAT=FILE",
-    help="Also write the cameras for another program: opencv, colmap, ros (camera_info), kalibr (camchain), mrcal, metashape, matlab. "
-    "May be repeated.",
+    help="Also write the cameras for another program: opencv, colmap, ros (camera_info), kalibr (camchain), mrcal, metashape, matlab, "
+    "halcon, australis, photomodeler. May be repeated.",
 )
 @click.option("--colmap", type=click.Path(path_type=Path), metavar="FILE", help="Also write the cameras for COLMAP: cameras.txt.")
 @click.option(
@@ -187,7 +187,7 @@ def calibrate(
     put_pdf(pdf, lambda: _page_of(calibration))
     if wanted:
         rig = getattr(getattr(calibration, "tests", None), "rig", None)
-        made = write_exports(_models(calibration), wanted, may_lose_px, read, rig)
+        made = write_exports(_models(calibration), wanted, may_lose_px, read, rig, _known(calibration))
         for sentence in made.sentences:
             echo(sentence, err=written.printed)
         for path, problem in made.refused[1:]:
@@ -232,6 +232,17 @@ def _page_of(calibration: Any) -> Page:
     from pixmetry.calibrate.page import lines_page, page
 
     return lines_page.page_of(calibration) if isinstance(calibration, LineCalibration) else page.page_of(calibration)
+
+
+def _known(calibration: Any) -> dict[str, Any]:
+    """How well the cameras are known, by their names."""
+    from pixmetry.calibrate.exchange import Known
+    from pixmetry.calibrate.lines.plumb_line import LineCalibration
+
+    if isinstance(calibration, LineCalibration):
+        return {calibration.camera().name: Known(calibration.result.free, calibration.result.estimates.covariance)}
+    adjusted = calibration.adjustment
+    return {model.name: Known(*adjusted.interior_covariance(k)) for k, model in enumerate(_models(calibration))}
 
 
 def _models(calibration: Any) -> list[Any]:

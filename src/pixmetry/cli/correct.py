@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from pixmetry.assess.correct import FrameCorrection
 
-IN_POSITIONS = ("positions are", "coordinates are")  # in the reasons of sources that move points
+IN_POSITIONS = ("positions are", "coordinates are", "pixmetry corrected")  # in the reasons of sources that move points
 
 
 @click.command()
@@ -42,7 +42,9 @@ IN_POSITIONS = ("positions are", "coordinates are")  # in the reasons of sources
 @click.option("--list", "listed", is_flag=True, help="Only list what would be corrected and what not, with the reason.")
 @click.option("--raw", metavar="WxH:FORMAT", help="Layout of files without a header, e.g. 1920x1200:Mono12p (GenICam's names).")
 @click.option(
-    "--sequence", is_flag=True, help="The frames were taken one after the other, without a pause: correct what one leaves in the next."
+    "--sequence",
+    is_flag=True,
+    help="The frames were taken one after the other, without a pause: correct what one leaves in the next, and gains that differ.",
 )
 @click.option("--threads", type=click.IntRange(1), help="Number of threads. Default: one for each processor.")
 def correct(

@@ -46,12 +46,20 @@ KINDS = ("disc", "ellipse", "ring", "spot", "blob", "line", "edge", "cross", "ch
 @click.option(
     "--grid",
     metavar="COLSxROWS",
-    help="Size of the plate: inner corners of a chessboard, or dots. 'any' numbers the dots of a plate of unknown size.",
+    help="Size of the plate: inner corners of a chessboard, or dots. 'any' numbers the dots of a plate of unknown size; 'hexagonal' or "
+    "9x6:hexagonal those of one whose rows are shifted by half a step.",
 )
 @click.option(
     "--noise",
     metavar="CAMERA|KEY=NUMBER,…",
     help="Noise of the image: a camera (preset or camera.yaml), or read=1.5,gain=0.01,black=16 in DN. Default: estimated from the image.",
+)
+@click.option(
+    "--with",
+    "with_",
+    metavar="RESULTS|CAMERA",
+    help="In place of --noise: results of an assessment of this camera (folder or results.json). Uncertainties hold its correlated noise, "
+    "its defect pixels are left out.",
 )
 @click.option(
     "--bits",
@@ -75,6 +83,13 @@ KINDS = ("disc", "ellipse", "ring", "spot", "blob", "line", "edge", "cross", "ch
     show_default=True,
     help="Whether templates have slopes of light and background. auto: where they also predict pixels that were held back.",
 )
+@click.option(
+    "--dictionary",
+    default="RING_12",
+    show_default=True,
+    metavar="RING_N",
+    help="Codes of coded targets, by the segments of their rings: RING_8, RING_12, RING_14, RING_16 or RING_20.",
+)
 @click.option("--channel", type=click.Choice(["red", "green", "blue"]), help="Channel to use of colour images.")
 @click.option("--raw", metavar="WxH:FORMAT", help="Layout of files without a header, e.g. 1920x1200:Mono12p (GenICam's names).")
 @click.option("--roi", "rois", multiple=True, metavar="ROW,COL,ROWS,COLS", help="Region to look in: first pixel and size. May be repeated.")
@@ -88,6 +103,14 @@ KINDS = ("disc", "ellipse", "ring", "spot", "blob", "line", "edge", "cross", "ch
 @click.option("--diameter", metavar="LEAST,GREATEST", help="Only targets of this diameter at half height, px.")
 @click.option("--contrast", metavar="LEAST,GREATEST", help="Only targets of this height over the background, DN, bright or dark.")
 @click.option("--threshold", type=float, default=4.0, show_default=True, metavar="SIGMA", help="Threshold of detection over the noise.")
+@click.option(
+    "--false-alarms",
+    type=float,
+    default=0.01,
+    show_default=True,
+    metavar="NUMBER",
+    help="Faint targets: how many false ones a frame of noise may show on average. More find fainter ones.",
+)
 @click.option("--track", is_flag=True, help="Find targets in the first image only, and follow each of them through the others.")
 @click.option("--search", "search_px", type=float, metavar="PX", help="Of --track: how far from its expected place a target is looked for.")
 @click.option("--interval", "interval_s", type=float, metavar="S", help="Of --track: time from frame to frame.")
@@ -106,7 +129,9 @@ def locate(
     overlay: Path | None,
     polarity: str,
     grid: str | None,
+    dictionary: str,
     noise: str | None,
+    with_: str | None,
     bits: int | None,
     aperture: float,
     light_on: str,
@@ -119,6 +144,7 @@ def locate(
     diameter: str | None,
     contrast: str | None,
     threshold: float,
+    false_alarms: float,
     track: bool,
     search_px: float | None,
     interval_s: float | None,
@@ -157,9 +183,11 @@ def locate(
     regions = [_numbers(roi, "--roi", 4) for roi in rois] or None
     if track:
         for name, value, default in (
-            ("--overlay", overlay, None), ("--grid", grid, None), ("--aperture", aperture, 1.0), ("--light-on", light_on, "surface"),
+            ("--overlay", overlay, None), ("--with", with_, None), ("--grid", grid, None),
+            ("--aperture", aperture, 1.0), ("--light-on", light_on, "surface"),
+            ("--dictionary", dictionary, "RING_12"),
             ("--mask", mask, None), ("--places", places, None), ("--diameter", diameter, None), ("--contrast", contrast, None),
-            ("--threshold", threshold, 4.0), ("--planes", planes, "auto"),
+            ("--threshold", threshold, 4.0), ("--false-alarms", false_alarms, 0.01), ("--planes", planes, "auto"),
         ):  # fmt: skip
             if value != default:
                 raise click.UsageError(f"{name} is no option of --track")
@@ -177,7 +205,9 @@ def locate(
             overlay=overlay,
             polarity=polarity,
             grid=grid,
+            dictionary=dictionary,
             noise=noise,
+            with_=with_,
             bits=bits,
             aperture_px=aperture,
             light_on=light_on,
@@ -191,12 +221,13 @@ def locate(
             diameter_px=None if diameter is None else _numbers(diameter, "--diameter", 2),
             contrast_dn=None if contrast is None else _numbers(contrast, "--contrast", 2),
             threshold_sigma=threshold,
+            false_alarms=false_alarms,
         )
     if output is None:
         echo_lines(table.to_csv(), nl=False)
     for image in table.images:
         echo(f"{image['name']}: {image['targets']} found; {image['estimator']}: {image['reason']}", err=output is None)
-        for key in ("caution", "ground"):
+        for key in ("caution", "ground", "rings"):
             if key in image:
                 echo(f"{image['name']}: {key}: {image[key]}", err=output is None)
         if "left_out" in image:

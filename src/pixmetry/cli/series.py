@@ -92,7 +92,7 @@ def _follow(images: tuple[Path, ...], output: Path, options: dict[str, Any]) -> 
     """Look for new frames until it is interrupted, and tell what is known so far."""
     from pixmetry.core.errors import InputError, MeasureError
     from pixmetry.series.job import series as run
-    from pixmetry.series.page import stable_sentence
+    from pixmetry.series.page import outlook_sentence
 
     known, last = 0, ""
     try:
@@ -108,7 +108,7 @@ def _follow(images: tuple[Path, ...], output: Path, options: dict[str, Any]) -> 
                 found, told = None, str(problem)
             if found is not None and len(found.frames) > known:
                 known = len(found.frames)
-                told = f"{known} frames, {found.drift.time_s[-1] / 60:.1f} min: {stable_sentence(found.drift)}"
+                told = f"{known} frames, {found.drift.time_s[-1] / 60:.1f} min: {outlook_sentence(found.drift)}"
             if told != last:
                 echo(told, err=True)
                 last = told

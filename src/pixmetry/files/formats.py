@@ -41,11 +41,14 @@ class Decoded:
         Whether its coder keeps every value; None: not known.
     notes : tuple of str
         What the reader should know: loss, or that it is to be turned for display.
+    luminance_steps : tuple of int, optional
+        Steps of the quantiser of a JPEG's luminance, row by row, 64 of them; of a picture by `load_picture` only where it is grey.
     """
 
     array: np.ndarray
     lossless: bool | None = True
     notes: tuple[str, ...] = ()
+    luminance_steps: tuple[int, ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -275,7 +278,8 @@ def _jpeg(raw: bytes) -> Decoded:
     needed = facts.rows * facts.cols * facts.components * (1 if facts.bits <= 8 else 2)
     check_memory(needed, _what(facts.cols, facts.rows), remedy="cut the image into parts")
     coder = "JPEG, without loss" if facts.lossless else "JPEG: its coder has changed noise and fine structure"
-    return Decoded(imagecodecs.jpeg_decode(raw), facts.lossless, (coder, *_turned(facts.orientation)))
+    steps = None if facts.lossless else jpeg.luminance_table(raw)
+    return Decoded(imagecodecs.jpeg_decode(raw), facts.lossless, (coder, *_turned(facts.orientation)), steps)
 
 
 def _turned(orientation: int) -> tuple[str, ...]:

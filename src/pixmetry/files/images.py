@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -132,10 +133,12 @@ def load_picture(path: Path, channel: str | None = None, raw: RawLayout | None =
             keys = "`--channel green`; in a project `channel: green` under `pictures`"
             remedy = f"name the channel to measure in ({keys}), or store the sensor's raw values"
             raise InputError(what, where=str(path), allowed="one grey channel", remedy=remedy)
+        if not (array[:, :, :3] == array[:, :, :1]).all():  # a channel is luminance and chroma, each with steps of its own
+            found = replace(found, luminance_steps=None)
         array = array[:, :, CHANNELS[channel]]
     if array.dtype.kind == "f" and array.ndim == 2 and array.size:
-        return Decoded(np.ascontiguousarray(array, np.float32), found.lossless, found.notes)
-    return Decoded(_checked(array, path), found.lossless, found.notes)
+        return replace(found, array=np.ascontiguousarray(array, np.float32))
+    return replace(found, array=_checked(array, path))
 
 
 def picture_files(frames: Iterable[str | Path], endings: tuple[str, ...] = ENDINGS, raw: RawLayout | None = None) -> list[Path]:
