@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 
 Found = tuple[np.ndarray, np.ndarray]
-HOW = "pip install 'pixmetry[bench]'"
+HOW = "pip install 'pixmetry[peers]'"
 
 
 def _bright(frame: np.ndarray, dark: bool) -> np.ndarray:

@@ -249,3 +249,16 @@ def test_the_result_does_not_depend_on_the_threads(rng: np.random.Generator) -> 
     x, y = (a.ravel() for a in np.meshgrid(np.arange(60) * SIDE + HALF, np.arange(3) * SIDE + HALF))
     one, two = (corner_positions(frame, x, y, NoiseModel(1.0), threads=n) for n in (1, 2))
     assert (one.x_px == two.x_px).all() and (one.var_x_px2 == two.var_x_px2).all()
+
+
+@pytest.mark.parametrize("shift", [(1, 0), (-1, 0), (0, 1), (0, -1)])
+def test_the_outline_of_the_squares_is_no_row_of_corners(shift: tuple[int, int], rng: np.random.Generator) -> None:
+    """As a finder completes a board that the frame cuts: 9 × 6 places, one column or row of which lies on the outer edge of the squares."""
+    row, col = np.indices((7, 10))
+    board = np.pad(np.where((row + col) % 2 == 0, 30.0, 200.0).repeat(20, axis=0).repeat(20, axis=1), 40, constant_values=200.0)
+    frame = np.clip(np.rint(board + rng.normal(0, 2, board.shape)), 0, 255).astype(np.uint8)
+    r, c = np.divmod(np.arange(54), 9)
+    right = numbered_by_colours(frame, Grid(59.5 + 20.0 * c, 59.5 + 20.0 * r, r, c, 6, 9))
+    assert len(right) == 54 and not right.message
+    wrong = numbered_by_colours(frame, Grid(59.5 + 20.0 * (c + shift[0]), 59.5 + 20.0 * (r + shift[1]), r, c, 6, 9))
+    assert not len(wrong) and "part of a chessboard was found" in wrong.message

@@ -9,6 +9,7 @@ from scipy.ndimage import gaussian_filter
 from pixmetry.core.errors import InputError
 from pixmetry.locate.detect.detection import detect
 from pixmetry.locate.detect.grids import eight_bit, order_grid
+from pixmetry.locate.job import locate
 
 
 def plate(rng, rows: int, cols: int, *, asymmetric=False, tilt_deg=40.0, turn=None, distortion=0.1, missing=0.0, clutter=0):
@@ -203,3 +204,35 @@ def test_a_plate_of_known_size_is_numbered_whole_or_refused(rng: np.random.Gener
         assert "hardly there" in message or "not 10 × 8" in message
         x, y, i, j = rows_of(0, 7)
         assert order_grid(x, y, pattern=(10, 8)).message
+
+
+@pytest.mark.parametrize("drop", [0.0, 0.05])
+def test_hexagonal_plates_are_numbered(drop: float, rng: np.random.Generator) -> None:
+    """Turned up to 25°, tilted and distorted: every dot has the number that it was printed with."""
+    for cols, rows in ((7, 9), (20, 12)):
+        row, col = (a.ravel() for a in np.mgrid[:rows, :cols])
+        place = np.stack([2.0 * col + row % 2, np.sqrt(3) * row], axis=1) - (cols, rows)
+        turn = np.deg2rad(rng.uniform(-25, 25))
+        place = place @ np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+        place = place * (1, 0.85) / (1 + place @ rng.normal(0, 0.003, 2))[:, None]
+        place = 400 + 9 * place * (1 - 0.05 * (place**2).sum(axis=1, keepdims=True) / cols**2)
+        seen = rng.permutation(np.flatnonzero(rng.random(len(col)) >= drop))
+        grid = order_grid(*(place[seen] + rng.normal(0, 0.05, (len(seen), 2))).T, hexagonal=True)
+        np.testing.assert_array_equal(grid.row, row[seen] - row[seen].min())
+        np.testing.assert_array_equal(grid.col, col[seen])
+
+
+def test_a_hexagonal_plate_in_a_frame() -> None:
+    """Dots that cover half of the frame are all found and numbered; the size decides nothing else."""
+    y, x = np.indices((150, 160))
+    frame = np.full(x.shape, 200.0)
+    for row in range(8):
+        for col in range(9):
+            away = np.hypot(x - 14 - 15 * col - 7.5 * (row % 2), y - 15 - 15 * np.sqrt(0.75) * row)
+            frame -= 150 / (1 + np.exp(np.clip(4 * (away - 5.5), -50, 50)))
+    for grid in ("hexagonal", "9x8:hexagonal"):
+        table = locate(np.rint(frame).astype(np.uint8), grid=grid)
+        assert len(table) == 72 and (table.grid_row >= 0).all() and not set(table.grid_col) ^ set(range(9))
+        np.testing.assert_allclose(table.x_px, 14 + 15 * table.grid_col + 7.5 * (table.grid_row % 2), atol=0.1)
+    with pytest.raises(InputError, match="not the size of a grid"):
+        locate(np.rint(frame).astype(np.uint8), grid="9x8:round")

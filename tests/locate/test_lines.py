@@ -488,3 +488,17 @@ def test_a_candidate_without_a_line_is_refused(rng: np.random.Generator) -> None
     for image in (stored(np.full((60, 60), 100.0), rng), np.full((60, 60), 255, np.uint8)):
         p = line_positions(image, given, WHITE)
         assert p.flags[0] & (Flag.NOT_CONVERGED | Flag.FAINT)
+
+
+def test_a_line_outside_the_frame_has_no_position(rng: np.random.Generator) -> None:
+    """As the sides of a plate's squares that the frame cuts off: flagged, and the others are what they are without it."""
+    frame, candidates, _ = tiles("edge", 4, rng, sigma_px=1.0)
+    noise = NoiseModel(1.0)
+    alone = line_positions(frame, candidates, noise, "edge", "template")
+    away = [(200.0, -40.0, 190.0, -6.0), (-80.0, 20.0, -30.0, 20.0), (1e5, 1e5, 1e5 + 30, 1e5)]
+    names = ("x1_px", "y1_px", "x2_px", "y2_px")
+    ends = {name: np.append(getattr(candidates, name), [row[k] for row in away]) for k, name in enumerate(names)}
+    more = LineCandidates.of(**ends, blur_px=1.0, amplitude_dn=150.0, background_dn=10.0)
+    found = line_positions(frame, more, noise, "edge", "template")
+    assert np.isnan(found.x_px[4:]).all() and (found.flags[4:] & Flag.NOT_CONVERGED > 0).all()
+    np.testing.assert_allclose(found.x_px[:4], alone.x_px, atol=1e-3)

@@ -9,11 +9,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pixmetry.core._linear_algebra_kernels import factor_for, solve
 from pixmetry.core._normal_kernels import cdf, pdf
+from pixmetry.core.arrays import Array, Flags
 from pixmetry.core.jit import jit
 
 CLIP = 6.0  # standard deviations from the scale's ends within which clipping is looked at
 LEAST_SHARE = 0.05  # of the variance that clipping leaves: pixels far beyond the end, which say nothing, must not gain weight
+LEAST_GROUND = 0.25  # of a block's pixels, without targets, for its noise to be looked at
+OUTLIER_SIGMA = 4.0  # beyond which its pixels are left out
 
 
 class Noise(NamedTuple):
@@ -82,3 +86,51 @@ def variances_dn2(light_dn: NDArray[np.float64], noise: Any) -> NDArray[np.float
     """`variance_of` for an array; ``noise`` is a `Noise` or has its names."""
     law: Callable[..., NDArray[np.float64]] = variance_of.py_func
     return law(light_dn, noise)
+
+
+@jit
+def noise_in_block(block: Array, mask: Flags, low_dn: float, high_dn: float, grain_dn: float) -> bool:
+    """Take its plane off a square block, and put 0 outside of the mask, from which outliers are taken; False where it is no ground."""
+    side = len(block)
+    normal, right, plane, factor = np.zeros((3, 3)), np.zeros(3), np.zeros(3), factor_for(3)
+    size, step = np.empty(side * side), 2.0 / (side - 1)
+    for _ in range(2):
+        normal[:], right[:] = 0.0, 0.0
+        n = 0
+        for r in range(side):
+            y = r * step - 1.0
+            for c in range(side):
+                if mask[r, c]:
+                    x, v = c * step - 1.0, block[r, c]
+                    n += 1
+                    normal[1, 0] += x
+                    normal[2, 0] += y
+                    normal[1, 1] += x * x
+                    normal[2, 1] += x * y
+                    normal[2, 2] += y * y
+                    right[0] += v
+                    right[1] += v * x
+                    right[2] += v * y
+        normal[0, 0] = n
+        if n < LEAST_GROUND * side * side or not solve(normal, 3, right, 0.0, factor, plane):
+            return False
+        k = 0
+        for r in range(side):
+            for c in range(side):
+                if mask[r, c]:
+                    size[k] = abs(block[r, c] - plane[0] - plane[1] * (c * step - 1.0) - plane[2] * (r * step - 1.0))
+                    k += 1
+        spread = max(1.4826 * np.median(size[:n]), grain_dn)  # of rounded values the median may be 0
+        if spread <= 0.0 or plane[0] - 3.0 * spread < low_dn or plane[0] + 3.0 * spread > high_dn:
+            return False
+        k = 0
+        for r in range(side):
+            for c in range(side):
+                if mask[r, c]:
+                    mask[r, c] = size[k] < OUTLIER_SIGMA * spread
+                    k += 1
+    for r in range(side):
+        for c in range(side):
+            off = plane[0] + plane[1] * (c * step - 1.0) + plane[2] * (r * step - 1.0)
+            block[r, c] = block[r, c] - off if mask[r, c] else 0.0
+    return bool(np.count_nonzero(mask) >= LEAST_GROUND * side * side)

@@ -19,6 +19,7 @@ from pixmetry.files.images import load_picture, picture_files
 from pixmetry.files.output import Output, check_files, own_files, write_together
 from pixmetry.files.raw_values import RawLayout, layout_of
 from pixmetry.locate.job import locate
+from pixmetry.locate.known_camera import KnownCamera, known_camera
 from pixmetry.locate.noise import NoiseModel, noise_model
 from pixmetry.locate.records import Located, checked_table_name, joined
 
@@ -32,6 +33,7 @@ def locate_files(
     raw: str | RawLayout | None = None,
     progress: Progress | None = None,
     noise: NoiseModel | Camera | str | Path | None = None,
+    with_: KnownCamera | Camera | str | Path | None = None,
     mask: np.ndarray | str | Path | None = None,
     places_px: np.ndarray | str | Path | None = None,
     **options: Any,
@@ -52,7 +54,7 @@ def locate_files(
     raw : str or RawLayout, optional
         Of files without a header: ``"1920x1200:Mono12p"``, size and GenICam's pixel format.
     progress : callable (what, done, of), optional
-    noise, **options
+    noise, with_, **options
         As in `locate`.
     mask : ndarray or path, optional
         As in `locate`, or an image that is not 0 where targets may be.
@@ -73,6 +75,7 @@ def locate_files(
     tables_at = [] if output is None else [checked_table_name(output)]
     check_files([*tables_at, *written], files)  # before the work
     model = noise_model(noise)
+    known = None if with_ is None else known_camera(with_)
     report = progress or no_progress
     if isinstance(mask, str | Path):
         mask = load_picture(Path(mask)).array != 0
@@ -84,7 +87,8 @@ def locate_files(
         name = frame_name(path)
         try:
             picture = load_picture(path, channel, layout)
-            table = locate(picture.array, noise=model, name=name, **options)
+            steps = picture.luminance_steps if picture.array.dtype == np.uint8 else None
+            table = locate(picture.array, noise=model, with_=known, name=name, jpeg_steps=steps, **options)
         except InputError as problem:
             if str(path) in problem.where:
                 raise

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from pixmetry.core.errors import InputError
@@ -10,6 +12,7 @@ from pixmetry.locate.noise import NoiseModel
 MOSAIC_LEAST, MOSAIC_SIGMA = 0.02, 6.0  # difference of the two diagonals of 2 × 2 pixels: of the level, and of its standard error
 MOSAIC_CELLS = 8_000  # of 2 × 2 pixels that are looked at
 NEAR_END = 0.01  # of a float image's range: values that lie so near to its end
+LEAST_SPAN, USUAL_SPAN, MOST_SPAN = 0.1, 1024.0, 1e6  # of the grey values of a float frame
 PILED = 10  # pixels in 4 of one value at the end of an image before it is asked whether they were cut off there
 
 
@@ -42,6 +45,26 @@ def checked_frame(frame: np.ndarray, name: str = "frame") -> np.ndarray:
     if array.dtype.kind == "f" and array.dtype.itemsize > 4 and np.abs(array).max() > np.finfo(np.float32).max:
         raise InputError("grey values are too large", where=name, value=float(np.abs(array).max()), allowed="up to 3e38 (single precision)")
     return np.ascontiguousarray(array, np.float32)
+
+
+def unit_of(frame: np.ndarray) -> float:
+    """Power of two by which a float frame is to be divided, so that its grey values are of a size that single precision squares well.
+
+    1 for integers, and for floats that span 0.1 to 1e6. Frames in W/m² or in electrons per second may span 1e-9 or 1e20.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from pixmetry.locate.frame import unit_of
+    >>> unit_of(np.array([[0.0, 255.0]])), unit_of(np.array([[0.0, 1024.0 * 2.0**-40]])) == 2.0**-40
+    (1.0, True)
+    """
+    if frame.dtype.kind != "f" or not frame.size:
+        return 1.0
+    span = float(frame.max()) - float(frame.min())  # NaN where a value is
+    if not (0 < span < math.inf) or LEAST_SPAN <= span <= MOST_SPAN:
+        return 1.0
+    return 2.0 ** round(math.log2(span / USUAL_SPAN))
 
 
 def scale_ends(frame: np.ndarray, bits: int | None, noise: NoiseModel | None) -> tuple[float, float]:

@@ -7,14 +7,18 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from pixmetry.camera.camera import Camera
 from pixmetry.core.errors import InputError
-from pixmetry.locate.detect.detection import THRESHOLD_SIGMA
+from pixmetry.locate.detect.blocks import checked_steps
+from pixmetry.locate.detect.coded import RINGS_OF_12, segments_of
+from pixmetry.locate.detect.detection import FALSE_ALARMS, THRESHOLD_SIGMA
 from pixmetry.locate.detect.limits import Limits
 from pixmetry.locate.estimators import estimators, methods
-from pixmetry.locate.frame import checked_frame, looks_like_mosaic, scale_ends
-from pixmetry.locate.kinds import Measured, Task, beside, grid_size, locate_blobs, locate_chessboard, locate_lines, locate_spots
+from pixmetry.locate.frame import checked_frame, looks_like_mosaic, scale_ends, unit_of
+from pixmetry.locate.kinds import Measured, Task, beside, in_units, locate_blobs, locate_chessboard, locate_lines, locate_spots, wanted_grid
+from pixmetry.locate.known_camera import KnownCamera, known_camera, mended
 from pixmetry.locate.noise import NoiseModel, noise_model
 from pixmetry.locate.quality import quality_of
 from pixmetry.locate.records import Located
@@ -41,7 +45,9 @@ def locate(
     estimator: str = "auto",
     polarity: str = "auto",
     grid: str | tuple[int, int] | None = None,
+    dictionary: str = RINGS_OF_12,
     noise: NoiseModel | Camera | str | Path | None = None,
+    with_: KnownCamera | Camera | str | Path | None = None,
     bits: int | None = None,
     aperture_px: float = 1.0,
     light_on: str = "surface",
@@ -52,6 +58,8 @@ def locate(
     diameter_px: tuple[float, float] | None = None,
     contrast_dn: tuple[float, float] | None = None,
     threshold_sigma: float = THRESHOLD_SIGMA,
+    false_alarms: float = FALSE_ALARMS,
+    jpeg_steps: ArrayLike | None = None,
     threads: int | None = None,
     name: str = "frame",
 ) -> Located:
@@ -66,11 +74,17 @@ def locate(
         ``"auto"`` or one of `estimators(kind)`.
     polarity : {"auto", "bright", "dark"}
         Of the targets on their ground; ``"auto"`` finds both.
-    grid : "COLSxROWS", (cols, rows) or "any", optional
-        Inner corners of a chessboard; or number the dots of a plate (columns ``grid_col``, ``grid_row``).
+    grid : "COLSxROWS", (cols, rows), "any", "hexagonal" or "asymmetric", optional
+        Inner corners of a chessboard; or number the dots of a plate (columns ``grid_col``, ``grid_row``). Of one whose every other row is
+        shifted by half a step, also "COLSxROWS:hexagonal" and the like: dot (col, row) lies at (2 col + row % 2) half steps.
+    dictionary : str
+        Of the codes of coded targets, by the segments of their rings: ``RING_8``, ``RING_12``, ``RING_14``, ``RING_16`` or ``RING_20``.
     noise : NoiseModel, Camera, path, or str, optional
         What weights the fits and fills the covariances: a model, a camera (preset, ``camera.yaml``), or ``"read=…,gain=…,black=…"``
         (see `parse_noise`). By default it is measured in the image.
+    with_ : path, Camera or KnownCamera, optional
+        In place of ``noise``: results of an assessment of the camera (the folder, or its results.json). Its noise, what its pixels share
+        (rows, columns, neighbours) and its offsets are in the covariances, and its defect pixels are left out. A camera has no map of them.
     bits : int, optional
         Bits of a stored value; its greatest value is where the scale saturates. By default told from the image.
     aperture_px : float
@@ -92,6 +106,10 @@ def locate(
         rows are what they are without.
     threshold_sigma : float
         Threshold of detection in standard deviations of the background's noise.
+    false_alarms : float
+        Greatest expected number of false faint targets in a frame of noise.
+    jpeg_steps : array_like, shape (8, 8), optional
+        Steps of the quantiser of the JPEG that the frame was decoded from, blocks from the first pixel on. By default what the pixels tell.
     threads : int, optional
     name : str
         Of the image, for the table.
@@ -131,16 +149,35 @@ def locate(
         raise InputError(what, where="aperture_px", value=aperture_px, allowed="1", remedy=remedy)
     if planes not in PLANES:
         raise InputError("no such choice of planes", where="planes", value=planes, allowed="auto, never, always")
-    limits = Limits(rois, mask, places_px, diameter_px, contrast_dn, threshold_sigma)
+    segments = segments_of(dictionary)
+    limits = Limits(rois, mask, places_px, diameter_px, contrast_dn, threshold_sigma, false_alarms)
     if limits.given and kind in WORK and kind != "blob":
         allowed = "disc, ellipse, ring, spot, blob, coded"
         raise InputError(f"{limits.given[0]} is not for targets of this kind", where="kind", value=kind, allowed=allowed)
-    image = checked_frame(frame, name)
-    model = noise_model(noise)
+    array = np.asarray(frame)
+    unit = unit_of(array)
+    image = checked_frame(array if unit == 1 else array / unit, name)
+    if with_ is not None and noise is not None:
+        raise InputError("both a camera and a noise", where="with_", remedy="leave the noise out")
+    if with_ is not None and unit != 1:
+        raise InputError("grey values that no camera stores", where=name, remedy="give the frames as they were stored")
+    seen_before = None if with_ is None else known_camera(with_)
+    if seen_before is not None:
+        seen_before.check_bits(image, bits, name)
+    defects = None if seen_before is None else seen_before.defects_of(image.shape, name)
+    image = image if defects is None else mended(image, defects)
+    model = noise_model(noise) if seen_before is None else seen_before.noise
+    model = None if model is None else model.times(1 / unit)
+    contrast_dn = None if contrast_dn is None else (contrast_dn[0] / unit, contrast_dn[1] / unit)
+    limits = replace(limits, contrast_dn=contrast_dn)
     low, high = scale_ends(image, bits, model)
-    size = grid_size(grid, kind)
-    task = Task(image, kind, estimator, polarity, size, model, low, high, aperture_px, light_on, threads, PLANES[planes], limits)
-    measured = Measured(*WORK.get(kind, locate_spots)(task))
+    size = wanted_grid(grid, kind)
+    steps = None if jpeg_steps is None else checked_steps(jpeg_steps)
+    task = Task(
+        image, kind, estimator, polarity, size, model, low, high, aperture_px, light_on, threads, PLANES[planes], limits, unit, seen_before,
+        defects, steps, segments,
+    )  # fmt: skip
+    measured = in_units(Measured(*WORK.get(kind, locate_spots)(task)), unit)
     columns = beside(measured.columns, quality=quality_of(measured.columns))
     about = {"name": name, "rows": image.shape[0], "cols": image.shape[1], "targets": len(measured.columns["x_px"]), **measured.notes}
     if looks_like_mosaic(image):

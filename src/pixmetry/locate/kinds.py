@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from pixmetry.core.errors import InputError
+from pixmetry.locate.detect.blocks import Coder, coder_of
 from pixmetry.locate.detect.limits import Limits, detect_within
 from pixmetry.locate.detect.targets import Flag, LeftOut, Positions, Targets
 from pixmetry.locate.estimator import Settings
 from pixmetry.locate.estimators import BLOB_TEXT, D4SIGMA, SPOTS, are_beams, chosen_estimator, methods, seen_shape
+from pixmetry.locate.known_camera import KnownCamera
 from pixmetry.locate.lines.line_candidates import LineCandidates
 from pixmetry.locate.noise import ROUNDING_DN2, NoiseModel
 from pixmetry.locate.noise_correlation import with_correlation, with_own_residuals
@@ -22,7 +23,16 @@ WITH_ARTICLE = {"disc": "a disc", "ellipse": "an ellipse", "ring": "a ring", "sp
 UNSETTLED = "the fit did not converge"
 NO_BEAM = "no beam of its own: a lobe of another one, one that fills the frame, or its moments did not come to rest"
 FAINTEST_BEAM = 0.1  # height of a beam over that of the frame's strongest
+TEMPLATES = ("template", "poisson_gaussian")  # estimators that can do without some pixels
+ROWS_ARE = ("asymmetric", "hexagonal")  # every other one shifted by half a step
 FAINTEST = 0.05  # height of lines and edges over that of the frame's strongest
+
+
+class Wanted(NamedTuple):
+    """What is asked for of a grid: columns and rows, where they are known, and how the rows lie."""
+
+    size: tuple[int, int] | None
+    rows_are: str  # "", "asymmetric", "hexagonal"
 
 
 @dataclass(frozen=True)
@@ -33,7 +43,7 @@ class Task:
     kind: str
     estimator: str
     polarity: str
-    grid: Any  # (cols, rows), "any" or None
+    grid: Wanted | None
     noise: NoiseModel | None
     low_dn: float
     high_dn: float
@@ -42,6 +52,11 @@ class Task:
     threads: int | None
     planes: str | bool = "auto"
     limits: Limits = Limits()
+    unit_dn: float = 1.0  # of the frame's grey values here, where they were made of another size for the arithmetic
+    known: KnownCamera | None = None
+    defects: np.ndarray | None = None  # bool, shape of the frame: pixels that it shows mended
+    jpeg_steps: np.ndarray | None = None  # of the quantiser, shape (8, 8), where the frame is from a JPEG file
+    segments: int = 12  # of the rings of coded targets
 
 
 class Measured(NamedTuple):
@@ -56,52 +71,66 @@ class Spots(NamedTuple):
     """Targets that are regions, as they were detected in a frame, and what their measurement needs besides."""
 
     targets: Targets
-    regions: Targets  # all that were seen, of any shape
+    regions: Targets  # all that were seen, of any shape, whole or not
     noise: NoiseModel
     seen: str  # shape of the template that suits them
     why: str
     polarity: str
     left_out: LeftOut
     ground: str  # "dark" or "bright" where targets cover the frame: the parts of it that were taken as their ground
+    coder: Coder | None
+    blanked: bool  # whether known targets cover so much that no faint ones were looked for
 
 
 class Seen(NamedTuple):
     """Regions of any shape as they were detected in a frame."""
 
-    regions: Any  # Regions
+    regions: Any  # Regions, whole ones
+    seen: Any  # Regions, also those that a region of interest cuts
     left_out: LeftOut
     polarity: str
     ground: str  # as of `Spots`
+    coder: Coder | None
+    blanked: bool
 
 
 def find_regions(task: Task) -> Seen:
     """Detect what a frame shows."""
-    from pixmetry.locate.detect.detection import detect
+    from pixmetry.locate.detect.detection import Detection, detect
 
-    look = partial(
-        detect,
-        polarity=task.polarity,
-        high_dn=task.high_dn,
-        low_dn=task.low_dn,
-        threshold_sigma=task.limits.threshold_sigma,
-        threads=task.threads,
-    )
-    regions, left_out, polarities, grounds = detect_within(task.frame, task.limits, look)
-    return Seen(regions, left_out, polarities.pop() if len(polarities) == 1 else "both", " and ".join(sorted(grounds)))
+    coder = coder_of(task.frame) if task.jpeg_steps is None else Coder(0, 0, task.jpeg_steps)
+
+    def look(part: np.ndarray, top: int, left: int) -> Detection:
+        return detect(
+            part,
+            polarity=task.polarity,
+            high_dn=task.high_dn,
+            low_dn=task.low_dn,
+            threshold_sigma=task.limits.threshold_sigma,
+            false_alarms=task.limits.false_alarms,
+            coder=None if coder is None else coder.within(top, left),
+            threads=task.threads,
+        )
+
+    found = detect_within(task.frame, task.limits, look)
+    polarity = found.polarities.pop() if len(found.polarities) == 1 else "both"
+    return Seen(found.targets, found.seen, found.left_out, polarity, " and ".join(sorted(found.grounds)), coder, found.blanked)
 
 
 def find_spots(task: Task, found: Seen | None = None) -> Spots:
     """Detect the targets of a frame that have the shape of the kind, and take the noise that is given, or that the frame shows."""
     from pixmetry.locate.detect.detection import seen_at, select
 
-    seen_ones, left_out, polarity, ground = find_regions(task) if found is None else found
+    found = find_regions(task) if found is None else found
+    seen_ones, left_out = found.regions, found.left_out
     shape = "ellipse" if task.kind == "coded" else task.kind
     fits = select(seen_ones, shape)
     targets = seen_ones[fits]
     left_out = LeftOut.joined([left_out, seen_at(seen_ones[~fits], f"not the shape of {WITH_ARTICLE[shape]}")])
     seen, why = seen_shape(shape, targets)
     noise = _noise_for(task, seen, targets)  # with the targets' own shape, whatever measures them: what it does not explain is noise
-    return Spots(targets, seen_ones, noise, seen, why, polarity if len(targets) else "none found", left_out, ground)
+    polarity = found.polarity if len(targets) else "none found"
+    return Spots(targets, found.seen, noise, seen, why, polarity, left_out, found.ground, found.coder, found.blanked)
 
 
 def locate_spots(task: Task) -> Measured:
@@ -109,7 +138,7 @@ def locate_spots(task: Task) -> Measured:
     found = find_regions(task)
     if task.kind == "spot" and (task.estimator == D4SIGMA or (task.estimator == "auto" and are_beams(found.regions))):
         return locate_beams(task, found)
-    targets, regions, noise, seen, why, polarity, left_out, ground = find_spots(task, found)
+    targets, regions, noise, seen, why, polarity, left_out, ground, coder, blanked = find_spots(task, found)
     shape = "ellipse" if task.kind == "coded" else task.kind
     estimator, reason = task.estimator, "as was asked for"
     if estimator == "auto":
@@ -117,27 +146,63 @@ def locate_spots(task: Task) -> Measured:
         estimator, reason = chosen_estimator(targets, noise, why)
     planes = False if task.kind == "coded" else task.planes  # the rings would pass for slopes
     settings = Settings(shape, planes, task.light_on, task.aperture_px, task.threads)
-    positions = methods()[estimator].positions(task.frame, targets, noise, settings)
-    positions, wider = with_correlation(task.frame, regions, targets, positions, noise, shape, task.aperture_px)
+    positions = methods()[estimator].positions(_without_defects(task, estimator), targets, noise, settings)
+    positions = _with_defects_flagged(task, targets, positions)
+    shared = None if task.known is None else task.known.correlation_at(float(np.median(task.frame)))
+    rows, cols = task.frame.shape
+    boxes, fitted = task.limits.boxes((rows, cols)), estimator == "template"
+    positions, wider, why_wider = with_correlation(
+        task.frame, regions, targets, positions, noise, shape, task.aperture_px, coder, shared, boxes, fitted=fitted
+    )
     positions = with_own_residuals(task.frame, targets, positions, noise, shape, task.aperture_px)
     columns = _columns(positions, estimator if shape == task.kind else f"{estimator} ({shape})", noise)
-    notes = _notes(estimator, reason, noise, polarity)
+    notes = _notes(task, estimator, reason, noise, polarity)
     if wider != 1.0:
-        notes["noise_model"] += f"; neighbouring pixels share noise, u × {wider:.2f}"
+        notes["noise_model"] += f"; {why_wider}, u × {wider:.2f}"
     if ground:
         taken = f"its {ground} parts were taken as the ground"
         notes["ground"] = f"targets cover much of the frame; {taken}, and faint targets were not looked for"
+    elif blanked:
+        notes["ground"] = "the targets cover more than 40 % of the frame; fainter ones than theirs were not looked for"
     settled, whole = settled_ones(positions), np.ones(len(positions), bool)
     if task.kind == "coded":
-        columns, whole = _coded(task, positions, columns)
+        columns, whole, caution = _coded(task, positions, columns)
+        notes |= {"rings": caution} if caution else {}
     if task.grid is not None:
         from pixmetry.locate.detect.grids import order_grid
 
-        placed = order_grid(positions.x_px, positions.y_px, pattern=None if task.grid == "any" else task.grid)
+        placed = order_grid(
+            positions.x_px,
+            positions.y_px,
+            pattern=task.grid.size,
+            asymmetric=task.grid.rows_are == "asymmetric",
+            hexagonal=task.grid.rows_are == "hexagonal",
+        )
         columns = beside(columns, grid_col=placed.col, grid_row=placed.row)
         count = f"{int(placed.placed[settled].sum())} of {int(settled.sum())} targets placed"
         notes["grid"] = placed.message or f"{placed.cols} x {placed.rows}, {count}"
     return _wanted_ones(task, targets, (settled, whole), Measured(columns, notes, left_out), UNSETTLED)
+
+
+def _without_defects(task: Task, estimator: str) -> np.ndarray:
+    """The frame as an estimator takes it: templates do without the pixels that are defect, others take what mends them."""
+    if task.defects is None or not estimator.startswith(TEMPLATES):
+        return task.frame
+    frame = task.frame.astype(np.float32)
+    frame[task.defects] = np.nan
+    return frame
+
+
+def _with_defects_flagged(task: Task, targets: Targets, positions: Positions) -> Positions:
+    """Targets with defect pixels within their outline or their light are flagged."""
+    if task.defects is None:
+        return positions
+    row, col = np.nonzero(task.defects)
+    reach = 2 * np.nan_to_num(targets.blur_px, nan=1.0) + 1
+    inside = (row >= (targets.row_first - reach)[:, None]) & (row < (targets.row_stop + reach)[:, None])
+    inside &= (col >= (targets.col_first - reach)[:, None]) & (col < (targets.col_stop + reach)[:, None])
+    hit = np.where(inside.any(axis=1), np.uint32(Flag.DEFECT), np.uint32(0))
+    return replace(positions, flags=positions.flags | hit)
 
 
 def _wanted_ones(task: Task, targets: Targets, usable: tuple[np.ndarray, np.ndarray], found: Measured, unsettled: str) -> Measured:
@@ -160,10 +225,12 @@ def locate_blobs(task: Task) -> Measured:
     """Regions of any shape."""
     from pixmetry.locate.centroids.light_moments import blob_positions
 
-    targets, left_out, polarity, _ = find_regions(task)
+    found_regions = find_regions(task)
+    targets, left_out, polarity = found_regions.regions, found_regions.left_out, found_regions.polarity
     noise = _smooth_noise(task, targets)
     positions = blob_positions(task.frame, targets, noise, threads=task.threads)
-    notes = _notes("light_centroid", BLOB_TEXT, noise, polarity if len(targets) else "none found")
+    positions = _with_defects_flagged(task, targets, positions)
+    notes = _notes(task, "light_centroid", BLOB_TEXT, noise, polarity if len(targets) else "none found")
     found = Measured(_columns(positions, "light_centroid", noise), notes, left_out)
     return _wanted_ones(task, targets, (settled_ones(positions), np.ones(len(targets), bool)), found, UNSETTLED)
 
@@ -179,9 +246,10 @@ def locate_beams(task: Task, found: Seen) -> Measured:
     targets = found.regions[strong]
     noise = _smooth_noise(task, targets)
     positions = beam_positions(task.frame, targets, noise, aperture_px=task.aperture_px, threads=task.threads)
+    positions = _with_defects_flagged(task, targets, positions)
     settled = settled_ones(positions)
     reason = "as was asked for" if task.estimator == D4SIGMA else "the spots are large or elliptic: beams, with widths by ISO 11146"
-    notes = _notes(D4SIGMA, reason, noise, found.polarity if settled.any() else "none found")
+    notes = _notes(task, D4SIGMA, reason, noise, found.polarity if settled.any() else "none found")
     measured = Measured(_columns(positions, D4SIGMA, noise), notes, LeftOut.joined([found.left_out, faint]))
     return _wanted_ones(task, targets, (settled, np.ones(len(targets), bool)), measured, NO_BEAM)
 
@@ -222,7 +290,7 @@ def locate_lines(task: Task) -> Measured:
         settled = settled_ones(positions)
         left_out.append(_lines_at(found[~settled], UNSETTLED))
     columns = _only(_columns(_with_variance_factor(positions, noise), estimator, noise), settled)
-    notes = _notes(estimator, reason if len(positions) else f"no {task.kind} was found", noise, _polarity(positions))
+    notes = _notes(task, estimator, reason if len(positions) else f"no {task.kind} was found", noise, _polarity(positions))
     return Measured(columns, notes, LeftOut.joined(left_out))
 
 
@@ -258,7 +326,8 @@ def locate_chessboard(task: Task) -> Measured:
     from pixmetry.locate.detect.background import background
     from pixmetry.locate.template.corners import chessboard_reach_px, find_chessboard, measured_corners
 
-    found = find_chessboard(task.frame, task.grid)
+    assert task.grid is not None and task.grid.size is not None  # of a chessboard it is asked for
+    found = find_chessboard(task.frame, task.grid.size)
     noise = _noise_for(task, "corner", background(task.frame, low_dn=task.low_dn, high_dn=task.high_dn, threads=task.threads).sigma_dn)
     reach = chessboard_reach_px(found) if len(found) else 0.0
     positions, noise = measured_corners(task.frame, found, reach, noise, aperture_px=task.aperture_px, threads=task.threads)
@@ -267,7 +336,7 @@ def locate_chessboard(task: Task) -> Measured:
     columns = beside(columns, grid_col=found.col, grid_row=found.row)
     settled = settled_ones(positions)
     left_out = LeftOut.of(found.x_px[~settled], found.y_px[~settled], UNSETTLED)
-    notes = _notes("template", reason, noise, "none found" if found.message else "both")
+    notes = _notes(task, "template", reason, noise, "none found" if found.message else "both")
     return Measured(_with_grid_scatter(_only(columns, settled), notes), notes, left_out)
 
 
@@ -332,19 +401,26 @@ def _columns(positions: Positions, estimator: str, noise: NoiseModel) -> dict[st
     }
 
 
-def _notes(estimator: str, reason: str, noise: NoiseModel, polarity: str) -> dict[str, Any]:
-    return {"polarity": polarity, "estimator": estimator, "reason": reason, "noise_model": noise.describe()}
+def _notes(task: Task, estimator: str, reason: str, noise: NoiseModel, polarity: str) -> dict[str, Any]:
+    return {"polarity": polarity, "estimator": estimator, "reason": reason, "noise_model": noise.times(task.unit_dn).describe()}
 
 
-def _coded(task: Task, positions: Positions, columns: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """The columns with each target's code, and which targets are no segments of a ring; a target that was lost has the code −1."""
-    from pixmetry.locate.detect.coded import read_codes, ring_members
+def _coded(task: Task, positions: Positions, columns: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], np.ndarray, str]:
+    """The columns with each target's code, and which targets are no segments of a ring; a target that was lost has the code −1.
+
+    Last, a sentence where the targets rather have other rings.
+    """
+    from pixmetry.locate.detect.coded import other_rings, read_codes, ring_members
 
     x, y, more = positions.x_px, positions.y_px, positions.more
     major, minor, angle = more["semi_major_px"], more["semi_minor_px"], more["angle_deg"]
-    codes = read_codes(task.frame, x, y, major, minor, angle, more["amplitude_dn"], threads=task.threads)
+    ellipses = x, y, major, minor, angle, more["amplitude_dn"]
+    codes = read_codes(task.frame, *ellipses, bits=task.segments, threads=task.threads)
+    other, count = other_rings(task.frame, *ellipses, codes.number, task.segments, task.threads)
+    read = int((codes.number >= 0).sum())
+    caution = f"{count} targets have codes of {other}, {read} of RING_{task.segments}: ask for dictionary {other}" if other else ""
     whole = ~ring_members(x, y, major, minor, angle, codes.number)
-    return beside(columns, code=codes.number, code_margin=codes.margin), whole
+    return beside(columns, code=codes.number, code_margin=codes.margin), whole, caution
 
 
 def settled_ones(positions: Positions) -> np.ndarray:
@@ -366,19 +442,41 @@ def beside(columns: dict[str, np.ndarray], **more: np.ndarray) -> dict[str, np.n
     return {**first, **more, **{name: columns[name] for name in LAST}}
 
 
-def grid_size(grid: str | tuple[int, int] | None, kind: str) -> tuple[int, int] | str | None:
+def in_units(found: Measured, unit_dn: float) -> Measured:
+    """Heights, levels and slopes in units of the grey values that were given."""
+    if unit_dn == 1:
+        return found
+    columns = {name: values * unit_dn if "_dn" in name else values for name, values in found.columns.items()}
+    return found._replace(columns=columns, left_out=replace(found.left_out, amplitude_dn=found.left_out.amplitude_dn * unit_dn))
+
+
+def wanted_grid(grid: str | tuple[int, int] | None, kind: str) -> Wanted | None:
+    """Read what is said of a grid: its size, ``any``, and how its rows lie, as in ``9x6``, ``any``, ``hexagonal``, ``9x6:hexagonal``.
+
+    Raises
+    ------
+    InputError
+        If it is none, or targets of this kind form none.
+    """
     if kind == "chessboard" and grid is None:
         raise InputError("the size of the chessboard is missing", where="grid", allowed="COLSxROWS of its inner corners, such as 9x6")
     if grid is not None and kind not in (*SPOTS, "chessboard"):
         raise InputError(f"targets of kind {kind} form no grid", where="grid", allowed="disc, ellipse, ring, spot, chessboard")
-    if grid is None or (grid == "any" and kind != "chessboard"):
-        return grid
-    size = tuple(grid.lower().split("x")) if isinstance(grid, str) else tuple(grid)
+    if grid is None:
+        return None
+    text, _, rows_are = grid.lower().partition(":") if isinstance(grid, str) else ("", "", "")
+    if text in ROWS_ARE:
+        text, rows_are = "any", text
+    if kind != "chessboard" and text == "any" and rows_are in ("", *ROWS_ARE):
+        return Wanted(None, rows_are)
+    size = tuple(text.split("x")) if isinstance(grid, str) else tuple(grid)
     try:
         cols, rows = (int(v) for v in size)
     except (TypeError, ValueError):
         cols = rows = 0
-    if cols < 2 or rows < 2:
-        allowed = "COLSxROWS, such as 9x6, both at least 2" + ("" if kind == "chessboard" else "; or any")
+    if cols < 2 or rows < 2 or (rows_are and (kind == "chessboard" or rows_are not in ROWS_ARE)):
+        allowed = "COLSxROWS, such as 9x6, both at least 2"
+        if kind != "chessboard":
+            allowed += "; or any; with :hexagonal or :asymmetric where every other row is shifted by half a step"
         raise InputError("not the size of a grid", where="grid", value=grid, allowed=allowed)
-    return cols, rows
+    return Wanted((cols, rows), rows_are)

@@ -5,7 +5,7 @@ A model is given in words, or read off a simulated camera's own forward model, s
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -81,6 +81,18 @@ class NoiseModel:
     def variance_dn2(self, level_dn: np.ndarray | float) -> np.ndarray:
         """Return the variance at given mean grey values; same shape, DN²."""
         return variances_dn2(np.maximum(np.asarray(level_dn, float) - self.black_dn, 0.0), self)
+
+    def with_constant(self, constant_dn2: float) -> NoiseModel:
+        """The same with another variance without light."""
+        return replace(self, constant_dn2=constant_dn2)
+
+    def times(self, factor: float) -> NoiseModel:
+        """The same noise of grey values that are so many times as large."""
+        if factor == 1:
+            return self
+        constant, slope = self.constant_dn2 * factor**2, self.slope_dn * factor
+        black, low, high = (v * factor for v in (self.black_dn, self.low_dn, self.high_dn))
+        return replace(self, constant_dn2=constant, slope_dn=slope, black_dn=black, low_dn=low, high_dn=high)
 
     def numbers(self, dtype: np.dtype | None = None) -> Noise:
         """Return the model as kernels read it; the range of an integer type, where one is given, ends the scale too."""

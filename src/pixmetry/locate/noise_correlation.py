@@ -12,24 +12,33 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from pixmetry.locate.coded_noise import coder_spread
+from pixmetry.locate.detect.blocks import Coder, noise_before
 from pixmetry.locate.detect.targets import Flag, Positions, Targets
+from pixmetry.locate.drawn_targets import Drawn, Spread, drawn_target
 from pixmetry.locate.noise import NoiseModel
+from pixmetry.locate.shared_shape import SharedShape, shared_shape
 
 BLOCK_PX = 64  # side of a block of ground that is looked at
 BLOCKS = 12  # about so many
 LAGS_PX = 24  # farther apart only rows and columns are alike
-LEAST_GROUND = 0.25  # of a block's pixels, without targets
-OUTLIER_SIGMA = 4.0
 NEAR_PX = 3  # within which pixels are alike in proportion to their noise, as filters make them; farther on by so many DN²
 FAR_PX = 12  # from here on what rows and columns share is the same at all distances
 CLEAR_SIGMA = 4.0  # by which noise must differ from that of independent pixels (6e-5 by chance)
 CLASSES = 5  # sizes of targets whose gains are computed
 ALIKE = 1.1  # ratio of sizes that are one
 UNLIKE = 1.5  # ratio of the variances of targets and ground from which their noise may be of another kind
-SAMPLE = 24  # targets whose residuals are looked at then
+SAMPLE, LARGE_SAMPLE = 24, 80  # targets whose residuals are looked at then; where they share a shape that is not the template's
 MOST_POOR = 100  # poor fits whose own residuals are looked at
+BY_NEIGHBOURS = "neighbouring pixels share noise"  # why uncertainties are others than those of independent pixels
+BY_CODER = "a coder of blocks (JPEG) rounded the picture"
+BY_SHAPE = "the shape that all targets share is not quite the template's, which is no noise"
+HALVINGS = 6  # of the search for the noise before a coder
 LEAST_SHARE = 0.01  # of the noise's variance: ground without noise tells nothing
 LEAST_FACTOR = 0.05  # of a variance: opposite neighbours do not take more
+
+
+Boxes = list[tuple[int, int, int, int]]  # first row, stop row, first column, stop column of each
 
 
 @dataclass(frozen=True)
@@ -65,7 +74,7 @@ class Correlation:
         return out, pairs
 
 
-def correlation_of(frame: np.ndarray, targets: Targets, low_dn: float, high_dn: float) -> Correlation | None:
+def correlation_of(frame: np.ndarray, targets: Targets, low_dn: float, high_dn: float, boxes: Boxes | None = None) -> Correlation | None:
     """Measure the autocovariance of a frame's noise on blocks of ground without targets; None where there is too little.
 
     Parameters
@@ -75,25 +84,41 @@ def correlation_of(frame: np.ndarray, targets: Targets, low_dn: float, high_dn: 
         All regions that were found, whatever they are.
     low_dn, high_dn : float
         Ends of the scale; blocks in which it cuts the noise are left out.
+    boxes : list of (int, int, int, int), optional
+        Where targets were looked for: first row, stop row, first column, stop column. Elsewhere may be others.
 
     Notes
     -----
     Blocks of 64 × 64 pixels are spread over the frame. A plane is taken off each, values beyond 4 standard deviations are left out, and
     sums over pairs of pixels are correlations of the values and of the mask by Fourier transforms.
     """
+    n = 2 * LAGS_PX + 1
+    products, pairs = np.zeros((n, n)), np.zeros((n, n))
+    reach = np.ceil(4 * np.nan_to_num(targets.blur_px, nan=1.0) + 2).astype(int)
+    about = np.stack([targets.row_first - reach, targets.row_stop + reach, targets.col_first - reach, targets.col_stop + reach])
+    for top, bottom, left, right in boxes or [(0, frame.shape[0], 0, frame.shape[1])]:
+        _add_products(frame[top:bottom, left:right], about - np.array([[top], [top], [left], [left]]), (low_dn, high_dn), products, pairs)
+    if not pairs.any():
+        return None
+    pairs = np.rint(pairs)
+    return Correlation(np.where(pairs > 0.5, products / np.maximum(pairs, 1.0), 0.0), pairs)
+
+
+def _add_products(frame: np.ndarray, box: np.ndarray, ends_dn: tuple[float, float], products: np.ndarray, pairs: np.ndarray) -> None:
+    """Add the products of pixels at all lags, and their pairs, on ground outside of the boxes of targets."""
     from scipy.fft import irfft2, next_fast_len, rfft2
+
+    from pixmetry.locate._noise_kernels import noise_in_block
 
     rows, cols = frame.shape
     side = min(BLOCK_PX, rows, cols)
     if side < 2 * FAR_PX:
-        return None
+        return
     most_y, most_x = rows // side, cols // side
     ny = min(most_y, max(1, round(np.sqrt(BLOCKS * rows / cols))))
     nx = min(most_x, max(1, BLOCKS // ny))
     tops = np.linspace(0, rows - side, ny).round().astype(int)
     lefts = np.linspace(0, cols - side, nx).round().astype(int)
-    reach = np.ceil(4 * np.nan_to_num(targets.blur_px, nan=1.0) + 2).astype(int)
-    box = np.stack([targets.row_first - reach, targets.row_stop + reach, targets.col_first - reach, targets.col_stop + reach])
     values, masks = [], []
     for top in tops:
         for left in lefts:
@@ -101,165 +126,144 @@ def correlation_of(frame: np.ndarray, targets: Targets, low_dn: float, high_dn: 
             near = (box[0] < top + side) & (box[1] > top) & (box[2] < left + side) & (box[3] > left)
             for first, stop, begin, end in box[:, near].T:
                 mask[max(first - top, 0) : stop - top, max(begin - left, 0) : end - left] = False
-            ground = _noise_in(block, mask, low_dn, high_dn, 0.6 if frame.dtype.kind == "u" else 0.0)
-            if ground is not None:
-                values.append(ground)
+            if noise_in_block(block, mask, *ends_dn, 0.6 if frame.dtype.kind == "u" else 0.0):
+                values.append(block)
                 masks.append(mask)
     if not values:
-        return None
+        return
     full = next_fast_len(side + LAGS_PX, real=True)
     seen, there = np.stack(values).astype(np.float32), np.stack(masks).astype(np.float32)
-    products = irfft2((np.abs(rfft2(seen, (full, full))) ** 2).sum(axis=0), (full, full))
-    pairs = irfft2((np.abs(rfft2(there, (full, full))) ** 2).sum(axis=0), (full, full))
-    lags = np.arange(-LAGS_PX, LAGS_PX + 1)
-    products, pairs = products[np.ix_(lags, lags)], np.rint(pairs[np.ix_(lags, lags)])
-    return Correlation(np.where(pairs > 0.5, products / np.maximum(pairs, 1.0), 0.0), pairs)
+    lags = np.ix_(*[np.arange(-LAGS_PX, LAGS_PX + 1)] * 2)
+    products += irfft2((np.abs(rfft2(seen, (full, full))) ** 2).sum(axis=0), (full, full))[lags]
+    pairs += irfft2((np.abs(rfft2(there, (full, full))) ** 2).sum(axis=0), (full, full))[lags]
 
 
-def _noise_in(block: np.ndarray, mask: np.ndarray, low_dn: float, high_dn: float, grain_dn: float) -> np.ndarray | None:
-    """A block less its plane, 0 outside of the mask, from which outliers are taken; None where it is no ground."""
-    if mask.mean() < LEAST_GROUND:
-        return None
-    side = len(block)
-    line = np.linspace(-1, 1, side)
-    design = np.stack([np.ones(side * side), np.tile(line, side), np.repeat(line, side)])
-    spread = 0.0
-    for _ in range(2):
-        here = mask.ravel()
-        part = design[:, here]
-        plane = np.linalg.solve(part @ part.T, part @ block.ravel()[here])
-        left = block - (plane @ design).reshape(block.shape)
-        spread = max(1.4826 * float(np.median(np.abs(left[mask]))), grain_dn)  # of rounded values the median may be 0
-        level = float(plane[0])
-        if spread <= 0 or level - 3 * spread < low_dn or level + 3 * spread > high_dn:
-            return None
-        mask &= np.abs(left) < OUTLIER_SIGMA * spread
-        if mask.mean() < LEAST_GROUND:
-            return None
-    return np.where(mask, left, 0.0)
-
-
-@dataclass(frozen=True)
-class Spread:
-    """What correlated noise makes of the covariance of a target: factors of its variances, and what is added to the correlation of x and y.
-
-    Parameters
-    ----------
-    factor : ndarray, shape (parameters,)
-        Of the variance of each parameter, those of x and y first.
-    cross : float
-        Covariance of x and y over the root of the product of their variances for independent pixels, which correlated noise adds.
-    clear : bool
-        Whether the noise differs from that of independent pixels for certain.
-    """
-
-    factor: np.ndarray
-    cross: float
-    clear: bool
-
-
-@dataclass(frozen=True)
-class Drawn:
-    """A fitted target as its template draws it, in a window of its own.
-
-    Parameters
-    ----------
-    mean : ndarray, shape (side, side)
-        Grey values, DN.
-    jacobian : ndarray, shape (parameters, side, side)
-        Their derivatives; by x and y first.
-    mask : ndarray of bool, shape (side, side)
-        Pixels that are used.
-    residual : ndarray, shape (side, side)
-        What it leaves of the frame, DN; 0 outside of the mask.
-    """
-
-    mean: np.ndarray
-    jacobian: np.ndarray
-    mask: np.ndarray
-    residual: np.ndarray
-
-    def gains(self, noise: NoiseModel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Noise of each pixel, DN; gains of the parameters, rows of (JᵀWJ)⁻¹JᵀW, times that noise; an orthonormal basis of W^½ J."""
-        sigma = np.sqrt(noise.variance_dn2(self.mean))
-        white = np.where(self.mask, self.jacobian / sigma, 0.0).reshape(len(self.jacobian), -1)
-        scale = np.sqrt((white**2).sum(axis=1, keepdims=True))
-        basis, triangle = np.linalg.qr((white / scale).T)
-        shape = (-1, *self.mean.shape)
-        return sigma, (np.linalg.pinv(triangle, rcond=1e-9) @ basis.T / scale).reshape(shape), basis.T.reshape(shape)
-
-
-def lag_sums(one: np.ndarray, other: np.ndarray | None = None) -> np.ndarray:
-    """Sums of products of pixels at all lags, over all images of a stack (…, side, side); shape (2 side − 1, 2 side − 1)."""
+def lag_sums(stack: np.ndarray, other: np.ndarray | None = None) -> np.ndarray:
+    """Sums of products of pixels at all lags, of each image of a stack (n, side, side); shape (n, 2 side − 1, 2 side − 1)."""
     from scipy.fft import irfft2, next_fast_len, rfft2
 
-    side = one.shape[-1]
+    side = stack.shape[-1]
     full = next_fast_len(2 * side - 1, real=True)
-    first = rfft2(one, (full, full))
-    both = first * np.conj(first if other is None else rfft2(other, (full, full)))
+    first = rfft2(stack, (full, full))
+    both = first.real**2 + first.imag**2 if other is None else first * np.conj(rfft2(other, (full, full)))
     order = np.arange(1 - side, side)
-    return irfft2(both.reshape(-1, *both.shape[-2:]).sum(axis=0), (full, full))[np.ix_(order, order)]
+    found: np.ndarray = irfft2(both, (full, full))[:, order[:, None], order]
+    return found
 
 
-def residual_correlation(drawn: list[Drawn], noise: NoiseModel) -> np.ndarray:
+def residual_correlation(drawn: list[Drawn], noise: NoiseModel, sigmas_dn: list[np.ndarray] | None = None) -> np.ndarray:
     """Autocorrelation of what templates leave, at lags up to `NEAR_PX`; shape (lags, lags), 1 in the middle.
 
     Residuals are those of all pixels less what the unknowns take: for independent pixels (I − H) in place of I, which is allowed for.
+    ``sigmas_dn``: noise of the pixels of each, where it is not that of the noise model.
     """
     n = 2 * NEAR_PX + 1
     total, count = np.zeros((n, n)), np.zeros((n, n))
-    for one in drawn:
+    for k, one in enumerate(drawn):
         sigma, _, basis = one.gains(noise)
+        sigma = sigma if sigmas_dn is None else sigmas_dn[k]
         side = len(one.mean)
         middle = slice(side - 1 - NEAR_PX, side + NEAR_PX)
-        total += (lag_sums(one.residual / sigma) + lag_sums(basis))[middle, middle]
-        count += lag_sums(one.mask.astype(float))[middle, middle]
+        sums = lag_sums(np.concatenate([[one.mask, one.residual / sigma], basis]))[:, middle, middle]
+        total += sums[1:].sum(axis=0)
+        count += sums[0]
     ratio: np.ndarray = total / np.maximum(count, 1.0)
     return ratio / max(float(ratio[NEAR_PX, NEAR_PX]), 1e-30)
 
 
-def spread_of(one: Drawn, noise: NoiseModel, known: Correlation, near_alike: np.ndarray | None = None) -> Spread:
-    """Compute what correlated noise does to a least-squares fit with the weights of independent pixels.
+@dataclass(frozen=True)
+class Shared:
+    """Autocovariance of the noise at the lags of a target's window.
 
-    ``near_alike``: the autocorrelation at the target itself, where it is not that of the ground (`residual_correlation`).
+    Parameters
+    ----------
+    here : ndarray, shape (2 side − 1, 2 side − 1)
+        Correlation at the lags that go with the noise of the pixels.
+    around : ndarray, shape (2 side − 1, 2 side − 1)
+        Covariance at the others, DN².
+    pairs : ndarray, shape (2 side − 1, 2 side − 1)
+        Of pixels that they are from.
+    variance_dn2 : float
+        Of a pixel of the ground.
     """
-    sigma, gain, basis = one.gains(noise)
+
+    here: np.ndarray
+    around: np.ndarray
+    pairs: np.ndarray
+    variance_dn2: float
+
+
+def _shared(one: Drawn, noise: NoiseModel, known: Correlation, near_alike: np.ndarray | None = None) -> Shared:
+    """What the pixels of a target share, the variances themselves left out."""
     side = len(one.mean)
     covariance, pairs = known.over(side)
     lag = np.abs(np.arange(1 - side, side))
     near = np.maximum(lag[:, None], lag) <= NEAR_PX
     # the noise model's variance on the ground, and not that of the blocks: what rows share must cancel in x to the last percent
     variance = float(noise.variance_dn2(np.median(one.mean[[0, -1]])))
-    here = np.where(near, covariance / known.variance_dn2, 0.0)
-    around = np.where(near, 0.0, covariance * variance / known.variance_dn2)
+    ratio = covariance / known.variance_dn2
+    here, around = np.where(near, ratio, 0.0), np.where(near, 0.0, ratio * variance)
     if near_alike is not None:
         middle = slice(side - 1 - NEAR_PX, side + NEAR_PX)
         here[middle, middle] = near_alike
     here[side - 1, side - 1] = 0.0  # the variance itself is that of the noise model
+    return Shared(here, around, pairs, variance)
+
+
+def differs_clearly(one: Drawn, noise: NoiseModel, known: Correlation) -> bool:
+    """Whether the noise differs from that of independent pixels for certain, in what it does to x or y."""
+    sigma, gain, _ = one.gains(noise)
+    shared, place, side = _shared(one, noise, known), gain[:2], len(one.mean)
+    own, in_dn = np.split(lag_sums(np.concatenate([place, place / sigma])), 2)
+    excess = (own * shared.here + in_dn * shared.around).sum(axis=(1, 2))
+    own[:, side - 1, side - 1] = 0.0
+    lag = np.abs(np.arange(1 - side, side))
+    near = np.maximum(lag[:, None], lag) <= NEAR_PX
+    by_chance = 2 * np.where(near, own, in_dn * shared.variance_dn2) ** 2 / np.maximum(shared.pairs, 1.0)
+    return bool((np.abs(excess) > CLEAR_SIGMA * np.sqrt(by_chance[:, shared.pairs > 0].sum(axis=1))).any())
+
+
+def spread_of(
+    one: Drawn, noise: NoiseModel, known: Correlation, near_alike: np.ndarray | None = None, sigma_dn: np.ndarray | None = None
+) -> Spread:
+    """Compute what correlated noise does to a least-squares fit with the weights of independent pixels.
+
+    ``near_alike``: the autocorrelation at the target itself, where it is not that of the ground (`residual_correlation`). ``sigma_dn``:
+    the noise of its pixels, where it is not that of the weights.
+    """
+    sigma, gain, basis = one.gains(noise)
+    expected = (gain**2).sum(axis=(1, 2))
+    if sigma_dn is not None:
+        gain, sigma = gain * (sigma_dn / sigma), sigma_dn
+    shared = _shared(one, noise, known, near_alike)
     ground = gain / sigma  # answers to DN, for what rows and columns share
-    factor, clear = np.ones(len(gain)), 0.0
-    for k in range(len(gain)):
-        own, in_dn = lag_sums(gain[k]), lag_sums(ground[k])
-        total = float((gain[k] ** 2).sum())
-        excess = float((own * here).sum() + (in_dn * around).sum()) / total
-        factor[k] = 1 + excess
-        if k < 2:
-            own[side - 1, side - 1] = 0.0
-            by_chance = 2 * np.where(near, own, in_dn * variance) ** 2 / np.maximum(pairs, 1.0)
-            clear = max(clear, abs(excess) * total / np.sqrt(by_chance[pairs > 0].sum()))
-    x, y = gain[0], gain[1]
-    cross = float((lag_sums(x, y) * here).sum() + (lag_sums(ground[0], ground[1]) * around).sum()) / np.sqrt((x**2).sum() * (y**2).sum())
-    if noise.origin == "image":  # what the unknowns take of correlated noise is missing in the residuals that it was measured from
-        taken = float((lag_sums(basis) * (here + around / variance)).sum())
+    own, in_dn, of_basis = np.split(lag_sums(np.concatenate([gain, ground, basis])), 3)
+    factor = ((gain**2).sum(axis=(1, 2)) + (own * shared.here + in_dn * shared.around).sum(axis=(1, 2))) / expected
+    both = lag_sums(np.stack([gain[0], ground[0]]), np.stack([gain[1], ground[1]]))
+    cross = float((both[0] * shared.here + both[1] * shared.around).sum()) / np.sqrt(expected[0] * expected[1])
+    if noise.origin == "image" and sigma_dn is None:
+        # what the unknowns take of correlated noise is missing in the residuals that it was measured from
+        taken = float((of_basis * (shared.here + shared.around / shared.variance_dn2)).sum())
         count = float(one.mask.sum())
         factor *= (count - len(gain)) / max(count - len(gain) - taken, 0.5 * count)
-    return Spread(np.maximum(factor, LEAST_FACTOR), cross, clear > CLEAR_SIGMA)
+    return Spread(np.maximum(factor, LEAST_FACTOR), cross)
 
 
 def with_correlation(
-    frame: np.ndarray, regions: Targets, targets: Targets, positions: Positions, noise: NoiseModel, kind: str, aperture_px: float
-) -> tuple[Positions, float]:
-    """Positions with a covariance that holds the correlation of the frame's noise; and the factor of their u, 1 where there is none.
+    frame: np.ndarray,
+    regions: Targets,
+    targets: Targets,
+    positions: Positions,
+    noise: NoiseModel,
+    kind: str,
+    aperture_px: float,
+    coder: Coder | None = None,
+    known: Correlation | None = None,
+    boxes: Boxes | None = None,
+    *,
+    fitted: bool = True,
+) -> tuple[Positions, float, str]:
+    """Positions with a covariance that holds the correlation of the frame's noise; the factor of their u, and why: 1 and "" without it.
 
     The factors are those of the template, computed for a few sizes of targets. Other estimators answer to the same pixels in much the same
     way.
@@ -276,28 +280,56 @@ def with_correlation(
     kind : {"disc", "ellipse", "ring", "spot"}
         Of the template.
     aperture_px : float
+    coder : Coder, optional
+        That the frame went through. Where its steps are known, what it does to templates takes the place of the correlation.
+    known : Correlation, optional
+        What is known of the camera; by default what the ground between the targets tells.
+    boxes : list of (int, int, int, int), optional
+        Where targets were looked for, if not in the whole frame: only there is it known what is ground.
+    fitted : bool
+        Whether the positions are those of the template. What it leaves at others is their own error and its rough shape: no sign of a shape
+        that all targets share, or of more noise than the coder makes.
     """
     from pixmetry.locate.template.template import PARAMETERS
 
     good = np.flatnonzero(
         np.isfinite(positions.var_x_px2) & ((positions.flags & (Flag.BORDER | Flag.OVERLAPPING | Flag.NOT_CONVERGED)) == 0)
     )
-    known = correlation_of(frame, regions, noise.low_dn, noise.high_dn) if len(good) else None
-    if known is None or known.variance_dn2 <= LEAST_SHARE * noise.constant_dn2:
-        return positions, 1.0
+    if not len(good):
+        return positions, 1.0, ""
+    by_coder = coder is not None and coder.steps is not None
+    if by_coder:
+        known = None
+    elif known is None:
+        known = correlation_of(frame, regions, noise.low_dn, noise.high_dn, boxes)
+    if not by_coder and (known is None or known.variance_dn2 <= LEAST_SHARE * noise.constant_dn2):
+        return positions, 1.0, ""
     size = np.sqrt(targets.semi_major_px * targets.semi_minor_px)
     good = good[np.argsort(size[good], kind="stable")]
     count = 1 if size[good[-1]] < ALIKE * size[good[0]] else min(CLASSES, len(good))
     picked = good[np.rint((np.arange(count) + 0.5) / count * len(good) - 0.5).astype(int)]
-    drawn = [_drawn(frame, targets, positions, i, kind, aperture_px) for i in picked]
-    spreads = [spread_of(one, noise, known) for one in drawn]
-    if not any(s.clear for s in spreads):
-        return positions, 1.0
-    level = float(np.median(noise.variance_dn2(targets.background_dn[good] + 0.5 * targets.amplitude_dn[good])))
-    if not 1 / UNLIKE < level / known.variance_dn2 < UNLIKE:
-        some = good[np.unique(np.linspace(0, len(good) - 1, min(len(good), SAMPLE)).round().astype(int))]
-        alike = residual_correlation([_drawn(frame, targets, positions, i, kind, aperture_px) for i in some], noise)
-        spreads = [spread_of(one, noise, known, alike) for one in drawn]
+    drawn = [drawn_target(frame, targets, positions, i, kind, aperture_px) for i in picked]
+
+    def sample(most: int) -> list[Drawn]:
+        some = good[np.unique(np.linspace(0, len(good) - 1, min(len(good), most)).round().astype(int))]
+        return [drawn_target(frame, targets, positions, i, kind, aperture_px) for i in some]
+
+    if known is None:
+        assert coder is not None
+        before = noise_before(frame, coder, regions, boxes)
+        spreads, why = _of_coder(before, coder, noise, drawn, sample(SAMPLE), fitted), BY_CODER
+    else:
+        level = float(np.median(noise.variance_dn2(targets.background_dn[good] + 0.5 * targets.amplitude_dn[good])))
+        some = [] if 1 / UNLIKE < level / known.variance_dn2 < UNLIKE else sample(SAMPLE)
+        shared = shared_shape(some, noise) if fitted and noise.origin == "image" else None
+        if shared is not None:
+            some = sample(LARGE_SAMPLE)
+            spreads, why = _of_shared_shape(noise, known, shared_shape(some, noise) or shared, drawn, some), BY_SHAPE
+        elif any(differs_clearly(one, noise, known) for one in drawn):
+            alike = residual_correlation(some, noise) if some else None
+            spreads, why = [spread_of(one, noise, known, alike) for one in drawn], BY_NEIGHBOURS
+        else:
+            return positions, 1.0, ""
     at = np.log(size[picked])
 
     def over_sizes(values: list[float]) -> np.ndarray:
@@ -317,7 +349,37 @@ def with_correlation(
         var_y_px2=vy * fy + phase,
         more={**positions.more, **more},
     )
-    return changed, float(np.median(np.sqrt(0.5 * (fx + fy))[good]))
+    return changed, float(np.median(np.sqrt(0.5 * (fx + fy))[good])), why
+
+
+def _of_coder(before: float, coder: Coder, noise: NoiseModel, drawn: list[Drawn], some: list[Drawn], fitted: bool) -> list[Spread]:
+    """Spreads of templates that went through the coder after the noise ``before``; wider where more is left at some than it leaves."""
+    if not fitted and np.isfinite(before):
+        return [coder_spread(one, noise, coder, before)[0] for one in drawn]
+    shared = shared_shape(some, noise)
+    seen = some if shared is None else [shared.without(one) for one in some]
+    left = sum(float((one.residual**2 / noise.variance_dn2(one.mean)).sum()) for one in seen)
+    left /= sum(max(float(one.mask.sum()) - len(one.jacobian), 1.0) for one in seen)
+    if not np.isfinite(before):  # no ground: as much as leaves what is left at the targets
+        middle, low, before = drawn[len(drawn) // 2], 0.0, float(np.sqrt(left * noise.constant_dn2))
+        for _ in range(HALVINGS):
+            half = 0.5 * (low + before)
+            low, before = (half, before) if coder_spread(middle, noise, coder, half)[1] < left else (low, half)
+    through = [coder_spread(one, noise, coder, before) for one in drawn]
+    beyond = max(1.0, left / float(np.mean([residual for _, residual in through])))
+    return [replace(spread, factor=spread.factor * beyond) for spread, _ in through]
+
+
+def _of_shared_shape(noise: NoiseModel, known: Correlation, shared: SharedShape, drawn: list[Drawn], some: list[Drawn]) -> list[Spread]:
+    """Spreads by the noise that is left beside what all targets share, and by how that moves them at their places in the pixels."""
+    rest, sigmas = [shared.without(one) for one in some], [shared.sigma_dn(one, noise) for one in some]
+    level = float(np.mean([np.median(s[one.mask]) for s, one in zip(sigmas, some, strict=True)])) ** 2
+    alike = None if 1 / UNLIKE < level / known.variance_dn2 < UNLIKE else residual_correlation(rest, noise, sigmas)
+    count = min(len(one.jacobian) for one in (*some, *drawn))  # slopes are unknowns of some only
+    moved = np.square([shared.moved(one, noise)[:count] for one in some]).mean(axis=0)
+    variance = np.mean([(one.gains(noise)[1] ** 2).sum(axis=(1, 2))[:count] for one in some], axis=0)
+    spreads = [spread_of(one, noise, known, alike, shared.sigma_dn(one, noise)) for one in drawn]
+    return [replace(s, factor=s.factor[:count] + moved / variance) for s in spreads]
 
 
 def with_own_residuals(
@@ -338,7 +400,7 @@ def with_own_residuals(
     alone, factor = Correlation(wide, np.ones_like(wide)), np.ones((2, len(positions)))
     given = replace(noise, origin="given")
     for i in poor:
-        one = _drawn(frame, targets, positions, int(i), kind, aperture_px)
+        one = drawn_target(frame, targets, positions, int(i), kind, aperture_px)
         factor[:, i] = np.maximum(spread_of(one, given, alone, residual_correlation([one], given)).factor[:2], 1.0)
     return replace(
         positions,
@@ -346,33 +408,3 @@ def with_own_residuals(
         cov_xy_px2=positions.cov_xy_px2 * np.sqrt(factor[0] * factor[1]),
         var_y_px2=positions.var_y_px2 * factor[1],
     )
-
-
-def _drawn(frame: np.ndarray, targets: Targets, positions: Positions, i: int, kind: str, aperture_px: float) -> Drawn:
-    """One measured target as its template draws it."""
-    from pixmetry.locate.template.template import PARAMETERS, PLANES, model
-    from pixmetry.locate.template.template_fit import REACH, start_values
-
-    one = targets[i : i + 1]
-    # an ellipse's own unknowns follow from its axes and direction, which stand in the table
-    shape = {n: positions.more[n][i : i + 1] for n in ("semi_major_px", "semi_minor_px", "angle_deg", "blur_px") if n in positions.more}
-    one = replace(one, **shape)
-    start, outer, edge = start_values(one, kind, aperture_px)
-    names = (*PARAMETERS[kind], *PLANES)
-    given = {"x_px": positions.x_px[i], "y_px": positions.y_px[i]} | {n: v[i] for n, v in positions.more.items() if n in names}
-    values = {n: float(given.get(n, v)) for n, v in zip(names, start[0], strict=True)}
-    reach = float(outer[0] + REACH * edge[0] + 1)
-    half = int(np.ceil(reach))
-    row, col = round(values["y_px"]), round(values["x_px"])
-    local = values | {"x_px": values["x_px"] - col + half, "y_px": values["y_px"] - row + half}
-    side = 2 * half + 1
-    mean, jacobian = model(kind, np.array(list(local.values())), side, side, aperture_px=aperture_px)
-    base = len(PARAMETERS[kind])
-    ground, light = ((positions.flags[i] & f) != 0 for f in (Flag.UNEVEN_BACKGROUND, Flag.GRADIENT))
-    used = [*range(base), *([base, base + 1] if ground else []), *([base + 2, base + 3] if light else [])]
-    y, x = np.ogrid[:side, :side]
-    mask = np.hypot(x - local["x_px"], y - local["y_px"]) <= reach
-    rows, cols = np.arange(row - half, row + half + 1), np.arange(col - half, col + half + 1)
-    mask &= ((rows >= 0) & (rows < frame.shape[0]))[:, None] & ((cols >= 0) & (cols < frame.shape[1]))
-    seen = frame[np.ix_(np.clip(rows, 0, frame.shape[0] - 1), np.clip(cols, 0, frame.shape[1] - 1))].astype(float)
-    return Drawn(mean, jacobian[used], mask, np.where(mask, seen - mean, 0.0))

@@ -46,16 +46,12 @@ def quality_of(columns: Mapping[str, np.ndarray]) -> np.ndarray:
         usual = max(1.0, float(np.nanmedian(chi2))) if np.isfinite(chi2).any() else 1.0
         spread = np.hypot(np.sqrt(2 / np.maximum(columns["dof"], 1.0)), _spread(chi2 / usual))
         square += np.nan_to_num(np.maximum(chi2 / usual - 1, 0.0) / spread, nan=0.0) ** 2
-    if n > NEIGHBOURS:
-        from scipy.spatial import cKDTree
+    alike = [columns[name] for name in KIN if name in columns and np.isfinite(columns[name]).all()] if n > NEIGHBOURS else []
+    if alike:
+        from pixmetry.locate._quality_kernels import from_neighbours
 
-        place = np.stack([columns["x_px"], columns["y_px"]], axis=1)
-        near = cKDTree(place).query(place, NEIGHBOURS + 1)[1][:, 1:]
-        for name in KIN:
-            if name not in columns or not np.isfinite(columns[name]).all():
-                continue
-            values = columns[name] / max(float(np.median(np.abs(columns[name]))), 1e-300)
-            apart = values - np.median(values[near], axis=1)
+        values = np.stack([v / max(float(np.median(np.abs(v))), 1e-300) for v in alike])
+        for apart in from_neighbours(columns["x_px"], columns["y_px"], values, NEIGHBOURS):
             square += (apart / max(_spread(apart), LEAST_SPREAD)) ** 2
     quality: np.ndarray = 1 / (1 + square / HALF**2)
     for flag in DOUBTFUL:

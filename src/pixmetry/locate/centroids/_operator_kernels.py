@@ -36,6 +36,9 @@ PERIMETER, FORSTNER, ELLIPSE_EDGES, GAUSSIAN = 0, 1, 2, 3
 GRADIENT_NOISE = 2.0 * (9.0 + 100.0 + 9.0) / 1024.0  # variance of one component of Scharr's gradient per variance of a pixel
 MOST_RAYS = 192
 ROUND = 1.2  # ratio of the axes of an ellipse that is drawn as a disc is: the plateau in one go
+SIZES, DIAGONAL = 4, 5  # sizes of a class, half a pixel together; step between the phases of a rough look, of 4 × 4
+SMOOTH_PX = 0.6  # blur from which three places across a pixel do: 2e-5 of the height
+SINGLE = 3e-8  # of the height, which single precision does not hold
 GAUSSIAN_UNKNOWNS = 7
 GAUSSIAN_REST = 1e-10  # of the squared residuals: fall at which the fit of a Gaussian is at rest
 
@@ -147,8 +150,8 @@ def scharr(value: Array, a: int, b: int) -> tuple[float, float]:
 
 
 @jit
-def forstner_of(patch: Array, box: Ints, answer: Array) -> tuple[bool, float, float]:
-    """Point nearest to all lines along the gradients, weighted by their squares; ``answer`` (2, side, side): slopes by pixel.
+def forstner_of(patch: Array, box: Ints, inverse: Array) -> tuple[bool, float, float]:
+    """Point nearest to all lines along the gradients, weighted by their squares; ``inverse``, xx, xy, yy, of the normal equations.
 
     Return found, x, y. The noise of the gradients adds a multiple of the unit matrix that would pull to the window's centre; it is
     taken off.
@@ -170,7 +173,16 @@ def forstner_of(patch: Array, box: Ints, answer: Array) -> tuple[bool, float, fl
     if not (nxx > 0.0 and det > 0.0):
         return False, 0.0, 0.0
     ixx, ixy, iyy = nyy / det, -nxy / det, nxx / det
-    x, y = ixx * bx + ixy * by, ixy * bx + iyy * by
+    inverse[0], inverse[1], inverse[2] = ixx, ixy, iyy
+    return True, box[2] + ixx * bx + ixy * by, box[0] + ixy * bx + iyy * by
+
+
+@jit
+def forstner_slopes(patch: Array, box: Ints, inverse: Array, x: float, y: float, answer: Array) -> None:
+    """Slopes by pixel of what `forstner_of` returned, into ``answer`` (2, side, side)."""
+    rows, cols = box[1] - box[0], box[3] - box[2]
+    value, x, y = patch[0], x - box[2], y - box[0]
+    ixx, ixy, iyy = inverse[0], inverse[1], inverse[2]
     answer[:, :rows, :cols] = 0.0
     for a in range(1, rows - 1):
         for b in range(1, cols - 1):
@@ -194,7 +206,6 @@ def forstner_of(patch: Array, box: Ints, answer: Array) -> tuple[bool, float, fl
                 answer[1, a + 1, b + k] += w * qy
                 answer[0, a - 1, b + k] -= w * qx
                 answer[1, a - 1, b + k] -= w * qy
-    return True, box[2] + x, box[0] + y
 
 
 @jit
@@ -507,14 +518,17 @@ def operator_of(
     sums: Array,
     result: Array,
 ) -> bool:
-    """Position and covariance of one target by an operator; its window follows the squared centroid, then the estimate."""
+    """Position and covariance of one target by an operator; its window follows the squared centroid, then the estimate.
+
+    Without noise there is no covariance.
+    """
     moment_of(frame, record, i, SQUARED, noise, sums, result)
     cx, cy = result[0], result[1]
     if not (math.isfinite(cx) and math.hypot(cx - record[i, X], cy - record[i, Y]) < record[i, MINOR] + record[i, MARGIN]):
         cx, cy = record[i, X], record[i, Y]
     faint = result[5]
     result[:] = np.nan
-    at_rest = False
+    at_rest, inverse, x, y = False, np.empty(3), cx, cy
     for turn in range(12):
         if not cut_window(frame, record, i, cx, cy, noise, patch, box):
             return False
@@ -522,7 +536,7 @@ def operator_of(
             result[5] = faint
             return perimeter_of(patch, box, 0.5 * record[i, AMPLITUDE], result)
         if operator == FORSTNER:
-            found, x, y = forstner_of(patch, box, answer)
+            found, x, y = forstner_of(patch, box, inverse)
         elif operator == ELLIPSE_EDGES:
             found, x, y = edges_of(patch, box, record, i, cx, cy, answer)
         else:
@@ -536,7 +550,12 @@ def operator_of(
         if moved < 1e-3:
             at_rest = True
             break
-    propagate(answer, patch, record, i, box, result)
+    if noise.constant_dn2 > 0.0:
+        if operator == FORSTNER:
+            forstner_slopes(patch, box, inverse, x, y, answer)
+        propagate(answer, patch, record, i, box, result)
+    else:
+        result[2:5] = 0.0
     result[0], result[1], result[5] = cx, cy, faint
     return at_rest or moved < max(0.3 * math.sqrt(result[2] + result[4]), 0.02)
 
@@ -564,20 +583,25 @@ def radial_place(p: float, q: float, r: float, dx: float, dy: float, edge: float
 
 @jit
 def draw_target(
-    image: Singles, x: float, y: float, major: float, minor: float, angle: float, edge: float, profile: Array, step: float
+    image: Singles, x: float, y: float, major: float, minor: float, angle: float, edge: float, profile: Array, step: float, blur: float
 ) -> None:
-    """Draw a target by its radial profile, averaged over 5 × 5 places in each pixel.
+    """Draw a target by its radial profile, averaged over 5 × 5 places in each pixel, or 3 × 3 where the ``blur`` leaves nothing finer.
 
     ``edge`` is the profile's own radius; an ellipse has it along the normals to its outline.
     """
     p, q, r = quadratic_form(major, minor, angle)
     at = np.array([-0.453089922969332, -0.26923465505284155, 0.0, 0.26923465505284155, 0.453089922969332])
     weight = np.array([0.11846344252809454, 0.23931433524968324, 0.28444444444444444, 0.23931433524968324, 0.11846344252809454])
+    if blur > SMOOTH_PX:
+        at, weight = (
+            np.array([-0.3872983346207417, 0.0, 0.3872983346207417]),
+            np.array([0.2777777777777778, 0.4444444444444444, 0.2777777777777778]),
+        )
     last = profile.shape[0] - 1
     flat, dark = -1, last  # up to where the profile is 1, and from where it is 0: all of a pixel is alike there
-    while flat < last and profile[flat + 1] == 1.0:
+    while flat < last and profile[flat + 1] >= 1.0 - SINGLE:
         flat += 1
-    while dark > 0 and profile[dark - 1] == 0.0:
+    while dark > 0 and profile[dark - 1] <= SINGLE:
         dark -= 1
     even = flat >= 0 and major < ROUND * minor  # inside of a slim ellipse, distances from the outline do not grow evenly
     room = 0.7 * (major / minor) ** 2 / step + 1.0  # from a pixel's middle to its corners
@@ -591,8 +615,8 @@ def draw_target(
                 image[row, col] = 0.0
                 continue
             total = 0.0
-            for a in range(5):
-                for b in range(5):
+            for a in range(len(at)):
+                for b in range(len(at)):
                     place = radial_place(p, q, r, col + at[b] - x, row + at[a] - y, edge, step)
                     if place <= 0.0:
                         light = profile[0]
@@ -607,39 +631,57 @@ def draw_target(
 
 @jit
 def phase_variances(
-    shape: Array, first: int, stop: int, operator: int, phases: Array, nodes: Array, weights: Array, columns: int, out: Array
+    shape: Array,
+    first: int,
+    stop: int,
+    operator: int,
+    phases: Array,
+    nodes: Array,
+    weights: Array,
+    columns: int,
+    negligible: Array,
+    out: Array,
 ) -> None:
     """Variance over the sub-pixel phase of an operator for classes first … stop of targets, noise-free.
 
     ``shape`` (classes, 8): radius and blur (without the pixel) of the profile, half axes and angle at half height, blur with the pixel,
     margin of the window, and radius at half height. An S-curve swings with the size, over half a pixel or less: the largest of
-    four sizes over that counts.
+    four sizes over that counts. Where a few phases of two sizes, a quarter of a pixel apart, make less than is ``negligible``, they do.
     """
+    few = phases[::DIAGONAL].copy()
+    for i in range(first, stop):
+        rough = 0.0
+        for size in range(0, SIZES, 2):
+            rough += phase_variance(shape[i], 0.125 * size - 0.1875, operator, few, nodes, weights, columns)
+        out[i] = rough
+        if not rough < negligible[i]:
+            out[i] = 0.0
+            for size in range(SIZES):
+                out[i] = max(out[i], phase_variance(shape[i], 0.125 * size - 0.1875, operator, phases, nodes, weights, columns))
+
+
+@jit
+def phase_variance(shape: Array, change: float, operator: int, phases: Array, nodes: Array, weights: Array, columns: int) -> float:
+    """Variance over phases of one class whose size is changed."""
     noise = Noise(0.0, 0.0, 0.0, 0.0, -np.inf, np.inf, 0.0, 0.0)
     box, sums, result = np.zeros(4, np.int64), np.empty(15), np.empty(6)
-    for i in range(first, stop):
-        most = 0.0
-        for size in range(4):
-            change = 0.125 * size - 0.1875
-            major, minor = shape[i, 2] + change, shape[i, 3] + change
-            half = int(major + shape[i, 6] + 4.0)
-            side = 2 * half + 1
-            step = 0.05
-            profile = np.empty(int((major + shape[i, 6] + 6.0) * 1.5 / step))
-            disc_profile(max(shape[i, 0] + change, 0.05), shape[i, 1], nodes, weights, step, profile)
-            record = np.zeros((1, columns))
-            record[0, MAJOR], record[0, MINOR], record[0, ANGLE], record[0, MARGIN] = major, minor, shape[i, 4], shape[i, 6]
-            record[0, REACH], record[0, SIGN] = 4.0 * shape[i, 5], 1.0
-            image = np.empty((side, side), np.float32)
-            patch, answer = np.zeros((3, side + 9, side + 9)), np.zeros((2, side + 9, side + 9))
-            total, count = 0.0, 0
-            for phase in range(phases.shape[0]):
-                record[0, X], record[0, Y] = half + phases[phase, 0], half + phases[phase, 1]
-                draw_target(image, record[0, X], record[0, Y], major, minor, shape[i, 4], shape[i, 7] + change, profile, step)
-                record[0, AMPLITUDE] = image[half, half]
-                if operator_of(image, record, 0, operator, noise, patch, answer, box, sums, result):
-                    total += (result[0] - record[0, X]) ** 2 + (result[1] - record[0, Y]) ** 2
-                    count += 1
-            if count > 0:
-                most = max(most, 0.5 * total / count)
-        out[i] = most
+    major, minor = shape[2] + change, shape[3] + change
+    half = int(major + shape[6] + 4.0)
+    side = 2 * half + 1
+    step = 0.05
+    profile = np.empty(int((major + shape[6] + 6.0) * 1.5 / step))
+    disc_profile(max(shape[0] + change, 0.05), shape[1], nodes, weights, step, profile)
+    record = np.zeros((1, columns))
+    record[0, MAJOR], record[0, MINOR], record[0, ANGLE], record[0, MARGIN] = major, minor, shape[4], shape[6]
+    record[0, REACH], record[0, SIGN] = 4.0 * shape[5], 1.0
+    image = np.empty((side, side), np.float32)
+    patch, answer = np.zeros((3, side + 9, side + 9)), np.zeros((2, side + 9, side + 9))
+    total, count = 0.0, 0
+    for phase in range(phases.shape[0]):
+        record[0, X], record[0, Y] = half + phases[phase, 0], half + phases[phase, 1]
+        draw_target(image, record[0, X], record[0, Y], major, minor, shape[4], shape[7] + change, profile, step, shape[1])
+        record[0, AMPLITUDE] = image[half, half]
+        if operator_of(image, record, 0, operator, noise, patch, answer, box, sums, result):
+            total += (result[0] - record[0, X]) ** 2 + (result[1] - record[0, Y]) ** 2
+            count += 1
+    return 0.5 * total / count if count > 0 else 0.0

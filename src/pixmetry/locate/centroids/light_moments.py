@@ -15,13 +15,14 @@ from pixmetry.locate.noise import ROUNDING_DN2, NoiseModel
 REACH = 4.0  # of a blob's light beyond half its height, in standard deviations of its edge
 RIM_PX = 4.0  # width of the ground about it that its background is taken from, at least
 LEAST_GROUND = 24  # pixels
-APERTURE = 3.0  # side of the aperture over the beam's width, ISO 11146-1:2021, 7.2
+APERTURE = 3.0  # side of the aperture over the beam's width, ISO 11146-1:2021
 GROUND_FROM, GROUND_WIDTH = 1.2, 0.6  # where the ground of a beam begins, and its width, in half sides of the aperture
 PASSES, REST = 60, 1e-4  # of the widths and, relative to these, of the centroid
 DAMPED_FROM = 15
 TO_AND_FRO = 0.5  # of its u, by which a moment may still move as pixels of the ground come in and go out
 ROUND = 0.87  # ratio of the widths from which a beam is round and has no azimuth, ISO 11146-1:2021: its aperture is upright
 SMEAR_SIGNIFICANT = 6.0  # standard deviations of χ² of the columns' offsets over its expectation
+GRAIN, OUTLIER_SIGMA = 0.6, 4.0  # least spread of rounded values, DN; from where on a value of the ground is not its noise
 SECTORS = 8  # of the ground, whose means tell how far it is from a plane
 LEAST_SIDE_PX = 3.0
 CUT_SHARE = 1e-3  # of a beam's power beyond the frame's border, from which that is said
@@ -133,15 +134,18 @@ def _variances(grey: Array, noise: NoiseModel) -> Array:
     return variances
 
 
-def _ground(grey: Array, dx: Array, dy: Array, ring: Flags) -> Ground:
-    """A plane through the ground, without what lies 4 σ off, and its covariance from the scatter of pixels or, if larger, of sectors."""
+def _ground(grey: Array, dx: Array, dy: Array, ring: Flags, grain_dn: float = 0.0) -> Ground:
+    """A plane through the ground, without what lies 4 σ off, and its covariance from the scatter of pixels or, if larger, of sectors.
+
+    ``grain_dn``: least spread of rounded values, most of which may be alike.
+    """
     design, values = np.stack([np.ones(int(ring.sum())), dx[ring], dy[ring]], axis=1), grey[ring]
     use = np.ones(len(values), bool)
     for _ in range(4):
         plane = np.linalg.lstsq(design[use], values[use], rcond=None)[0]
         off = values - design @ plane
         sigma = 1.4826 * float(np.median(np.abs(off[use] - np.median(off[use]))))
-        sigma = sigma if sigma > 0 else float(off[use].std())
+        sigma = max(sigma, grain_dn) if sigma > 0 else float(off[use].std())
         before, use = use, np.abs(off) <= 4 * max(sigma, 1e-12)
         if (use == before).all() or use.sum() < LEAST_GROUND:
             break
@@ -354,23 +358,29 @@ class _Window:
         if ring.sum() < LEAST_GROUND:
             ring = np.ones(self.grey.shape, bool)
         none = np.zeros(self.grey.shape[1])
-        ground = _ground(self.grey, self.dx, self.dy, ring)
+        grain = GRAIN * (self.frame.dtype.kind == "u")
+        ground = _ground(self.grey, self.dx, self.dy, ring, grain)
         off = np.where(self.out, self.grey - np.einsum("k,krc->rc", ground.plane, self.design), np.nan)
         count = np.isfinite(off).sum(axis=0)
         if (count >= 6).sum() < 3:
             return ground, none, none
         with np.errstate(invalid="ignore"):
-            column = np.where(count >= 6, np.nanmedian(np.where(count >= 6, off, 0.0), axis=0), np.nan)
-        spread = 1.4826 * np.nanmedian(np.abs(off - column))
-        u = 1.2533 * spread / np.sqrt(np.maximum(count, 1))
+            middle = np.nanmedian(np.where(count >= 6, off, 0.0), axis=0)
+            usual = max(1.4826 * float(np.nanmedian(np.abs(off - middle))), grain)
+            good = np.abs(off - middle) < OUTLIER_SIGMA * usual  # their mean: a median of rounded values is one of them
+        off = np.where(good, off, np.nan)
+        count = good.sum(axis=0)
+        column = np.where(good, off, 0.0).sum(axis=0) / np.maximum(count, 1)
+        spread = math.sqrt(float(np.nansum((off - column) ** 2)) / max(float(count.sum() - (count > 0).sum()), 1.0))
+        u = spread / np.sqrt(np.maximum(count, 1))
         known = count >= 6
         if not spread > 0:
             return ground, none, none
-        chi2, many = float(((column[known] - np.median(column[known])) ** 2 / u[known] ** 2).sum()), int(known.sum())
+        chi2, many = float(((column[known] - column[known].mean()) ** 2 / u[known] ** 2).sum()), int(known.sum())
         if not smeared and chi2 < many + SMEAR_SIGNIFICANT * math.sqrt(2 * many):
             return ground, none, none
         offsets = np.where(known, column, 0.0)
-        again = _ground(self.grey - offsets, self.dx, self.dy, ring)
+        again = _ground(self.grey - offsets, self.dx, self.dy, ring, grain)
         return again, offsets, np.where(known, u, 0.0)
 
     def moments(self, sign: float, plane: Array, offsets: Array) -> Moments | None:

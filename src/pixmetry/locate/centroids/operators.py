@@ -16,6 +16,9 @@ from pixmetry.locate.noise import NoiseModel
 
 OPERATORS = {"perimeter": o.PERIMETER, "forstner": o.FORSTNER, "ellipse_edges": o.ELLIPSE_EDGES, "gaussian": o.GAUSSIAN}
 ASTRAY_PX = 1.0
+NEGLIGIBLE = (
+    0.003  # of the variance by noise: a rough variance over the phase that may stand for the whole one, which is up to a few times that
+)
 MARGINS = {"perimeter": 3.0, "forstner": 3.0, "ellipse_edges": 3.0, "gaussian": 4.0}
 RIM_PX = 2.0  # between window and border: 1.5 that gradients and rays read around the window, and a window's way from the rough centre
 
@@ -52,7 +55,7 @@ def operator_positions(frame: np.ndarray, targets: Targets, noise: NoiseModel, n
     has none, through the chance of each pixel to be taken over the threshold. The slopes of ``gaussian`` hold that its window follows
     the estimate (`gaussian_of` in the kernels has the formula): that is 12 % on a disc of radius 12 px and blur 2 px. The variance over
     the sub-pixel phase is added: that of the operator itself on noise-free images of targets of like size, blur and shape, the largest
-    over half a pixel of sizes, on pixels that are sensitive on their whole square.
+    over half a pixel of sizes (roughly where it is less than 0.3 % of the former), on pixels that are sensitive on their whole square.
 
     References
     ----------
@@ -64,16 +67,17 @@ def operator_positions(frame: np.ndarray, targets: Targets, noise: NoiseModel, n
         raise InputError("no such operator", value=name, allowed=", ".join(OPERATORS))
     operator, n = OPERATORS[name], len(targets)
     work = prepare(frame, targets, noise, margin=MARGINS[name], rim_px=RIM_PX, threads=threads)
-    s_curve = np.sqrt(_phase_variance(work, operator, threads))
     result, at_rest = np.full((n, 6), np.nan), np.zeros(n, bool)
     work.over(lambda a, b: o.operators(frame, work.record, a, b, operator, work.noise, result, at_rest), threads)
     # a fit that has left its target found something else
     lost = ~(np.hypot(result[:, 0] - targets.x_px, result[:, 1] - targets.y_px) < ASTRAY_PX + 0.25 * targets.semi_minor_px)
     result[lost], at_rest[lost] = np.nan, False
+    s_curve = np.sqrt(_phase_variance(work, operator, np.minimum(result[:, 2], result[:, 4]), threads))
     return positions(work, targets, noise, result, at_rest, s_curve)
 
 
-def _phase_variance(work: Prepared, operator: int, threads: int | None) -> np.ndarray:
+def _phase_variance(work: Prepared, operator: int, noise_px2: np.ndarray, threads: int | None) -> np.ndarray:
+    """Variance over the sub-pixel phase; only roughly where it is nothing beside the variance ``noise_px2`` by the pixels' noise."""
     record = work.record
     if not len(record):
         return np.zeros(0)
@@ -92,8 +96,10 @@ def _phase_variance(work: Prepared, operator: int, threads: int | None) -> np.nd
     steps = (np.arange(4) + 0.37) / 4 - 0.5
     phases = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
     nodes, weights = np.polynomial.legendre.leggauss(12)
-    out = np.zeros(len(shape))
-    run_slices(lambda a, b: o.phase_variances(shape, a, b, operator, phases, nodes, weights, COLUMNS, out), len(shape), threads)
+    out, least = np.zeros(len(shape)), np.full(len(shape), np.inf)
+    np.fmin.at(least, of, np.where(np.isfinite(noise_px2), noise_px2, 0.0))
+    negligible = NEGLIGIBLE * least
+    run_slices(lambda a, b: o.phase_variances(shape, a, b, operator, phases, nodes, weights, COLUMNS, negligible, out), len(shape), threads)
     phase: np.ndarray = out[of]
     return phase
 

@@ -3,7 +3,9 @@
 The scheme is that of C.-T. Schneider and K. Sinnreich, "Optical 3-D measurement systems for quality control in industry", Int. Archives
 of Photogrammetry and Remote Sensing XXIX-B5, 56 (1992): the ring is read as a cyclic binary word, and the number is the least of its
 rotations, so that a target needs no upright position. Here the printed segments are even in number, so that one misread segment never
-makes another code.
+makes another code. Rings of other numbers of segments, with radii of 1 : 2 : 3, are those of the expired patent DE 197 33 466 A1 too, which
+moreover wants a pair of opposite segments: its codes are some of these. Segment k, clockwise from the first, is bit k of the word; programs
+that begin with the highest bit have other numbers for the same rings, and so have those that count their codes.
 """
 
 from __future__ import annotations
@@ -19,10 +21,13 @@ from pixmetry.core.threads import map_tiles
 # Radii in units of the disc's: white or black (the colour of the background) from DISC to RING_INNER and from RING_OUTER to QUIET_OUTER.
 DISC, RING_INNER, RING_OUTER, QUIET_OUTER = 1.0, 2.0, 3.0, 4.0
 BITS = 12
+RINGS_OF_12 = "RING_12"
+RINGS = ("RING_8", "RING_12", "RING_14", "RING_16", "RING_20")  # by their segments: what is in use
 SAMPLES = 12  # directions a segment
 INSIDE = slice(2, SAMPLES - 2)  # of them, those away from the segment's ends
 RING_RADII, QUIET_RADIUS, OUTER_RADIUS = (2.3, 2.5, 2.7), 1.5, 3.5
 LEAST_MARGIN = 0.3
+LEAST_MORE = 1.25  # codes of another set, over those that were read, from which it is the right one
 MOST_OUTSIDE = 0.4  # of the disc's contrast: more is not quiet
 NOWHERE_PX = -1e6  # where targets without a position are put
 CHUNK = 128
@@ -43,6 +48,19 @@ class Codes:
 
     number: np.ndarray
     margin: np.ndarray
+
+
+def segments_of(dictionary: str) -> int:
+    """Segments a ring of a set of codes by its name: 14 of RING_14.
+
+    Raises
+    ------
+    InputError
+        If there is no such set.
+    """
+    if dictionary not in RINGS:
+        raise InputError("no such rings of coded targets", where="dictionary", value=dictionary, allowed=", ".join(RINGS))
+    return int(dictionary.removeprefix("RING_"))
 
 
 @cache
@@ -130,6 +148,38 @@ def read_codes(
     ones = _ones(word, bits)
     good = (margin >= least_margin) & quiet[0] & quiet[1] & (ones % 2 == 0) & (ones > 0) & (ones < bits)
     return Codes(np.where(good, least_rotation(word, bits), -1), margin)
+
+
+def other_rings(
+    frame: np.ndarray,
+    x_px: np.ndarray,
+    y_px: np.ndarray,
+    semi_major_px: np.ndarray,
+    semi_minor_px: np.ndarray,
+    angle_deg: np.ndarray,
+    amplitude_dn: np.ndarray,
+    number: np.ndarray,
+    bits: int,
+    threads: int | None = None,
+) -> tuple[str, int]:
+    """The set of codes that more of the targets have than the one that was read, and how many; ("", 0) where there is none.
+
+    A ring of few segments may pass for one of fewer or more; over several targets the right set has more codes, and clearer ones.
+
+    Parameters
+    ----------
+    frame, x_px, y_px, semi_major_px, semi_minor_px, angle_deg, amplitude_dn, threads
+        As of `read_codes`.
+    number : ndarray of int, shape (n,)
+        What it read.
+    bits : int
+        Segments for which it did.
+    """
+    ellipses = x_px, y_px, semi_major_px, semi_minor_px, angle_deg, amplitude_dn
+    counts = {name: int((read_codes(frame, *ellipses, bits=segments_of(name), threads=threads).number >= 0).sum()) for name in RINGS}
+    best = max(counts, key=lambda name: counts[name])
+    more = counts[best] >= LEAST_MORE * int((number >= 0).sum()) and counts[best] > 1
+    return (best, counts[best]) if segments_of(best) != bits and more else ("", 0)
 
 
 def ring_members(

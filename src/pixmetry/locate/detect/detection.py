@@ -10,7 +10,7 @@ import numpy as np
 from pixmetry.core.errors import InputError
 from pixmetry.core.threads import map_tiles
 from pixmetry.locate.detect.background import Background, background, bands_of, scale_of
-from pixmetry.locate.detect.blocks import block_origin, coder_height_dn
+from pixmetry.locate.detect.blocks import Coder, coder_height_dn, coder_of
 from pixmetry.locate.detect.targets import Flag, LeftOut, Targets
 
 POLARITIES = ("auto", "bright", "dark")
@@ -23,10 +23,11 @@ FALSE_ALARMS = 0.01  # a frame
 FARTHEST_PX = 12.0  # from the outline of a target that its skirt counts as its own
 FEEBLE = 0.2  # height, over the largest one's, below which a target may be an error of the ground between many targets
 MORE = 1.01  # area of targets that another reading of the background must show
+GROWN_PX = 0.25  # by which outlines at half height must be farther out where it shows no more targets: it is not the same at another level
 TWO_LEVELS = 0.8  # least share of the variance between two levels
 MOST_SEEN = 60000  # pixels
 RINGING = 0.08  # height of what rings around a target, over the target's
-CODED_RINGING = 0.2  # the same, in a frame whose blocks are visible
+CODED_RINGING, MOST_RINGING = 0.2, 0.5  # the same, in a frame whose blocks are visible; where the coder is coarse, at most
 BEYOND_DN = 1e30  # no grey value is so far from the background
 
 
@@ -73,6 +74,8 @@ class Detection:
         What the background is where targets cover the frame: its dark or its bright parts. Empty where it is what most pixels are.
     known : ndarray, shape (n, 5), int32
         Runs of pixels beyond the threshold that belong to targets: row, first and stop column, sign.
+    blanked : bool
+        Whether known targets cover so much of the frame that no fainter ones were looked for.
     """
 
     targets: Regions
@@ -82,6 +85,7 @@ class Detection:
     left_out: LeftOut = field(default_factory=LeftOut.of)
     reading: str = ""
     known: np.ndarray = field(default_factory=lambda: np.empty((0, 5), np.int32))
+    blanked: bool = False
 
 
 def detect(
@@ -93,6 +97,7 @@ def detect(
     least_area_px: int = LEAST_AREA_PX,
     threshold_sigma: float = THRESHOLD_SIGMA,
     false_alarms: float = FALSE_ALARMS,
+    coder: Coder | str | None = "auto",
     threads: int | None = None,
 ) -> Detection:
     """Find regions above (or below) the background.
@@ -111,6 +116,8 @@ def detect(
         Threshold in standard deviations of the background's noise. With a higher one than by default no fainter targets are looked for.
     false_alarms : float
         Greatest expected number of false targets that the matched filter finds in a frame of noise.
+    coder : Coder, "auto" or None
+        Of blocks, that the frame went through; "auto": what its pixels show (`coder_of`).
     threads : int, optional
 
     Raises
@@ -139,7 +146,7 @@ def detect(
         raise InputError("a threshold or area that no target exceeds", value=(threshold_sigma, least_area_px), allowed="above 0; 1 or more")
     if not 0 < false_alarms < math.inf:
         raise InputError("no rate of false alarms", where="false_alarms", value=false_alarms, allowed="above 0, such as 0.01")
-    look = _Look(frame, polarity, low_dn, high_dn, least_area_px, threshold_sigma, false_alarms, threads)
+    look = _Look(frame, polarity, low_dn, high_dn, least_area_px, threshold_sigma, false_alarms, coder, threads)
     found = look.detected("")
     if found.background.doubtful:
         found = look.better_reading(found)
@@ -159,6 +166,7 @@ class _Look:
     least_area_px: int
     threshold_sigma: float
     false_alarms: float
+    coder: Coder | str | None
     threads: int | None
 
     def detected(self, reading: str) -> Detection:
@@ -192,12 +200,13 @@ class _Look:
     def better_reading(self, usual: Detection) -> Detection:
         """The reading of the background whose targets cover the greatest area, where a frame of two grey levels leaves a choice."""
         best, most = usual, MORE * max(_target_area(usual.targets), 0.0)
+        whole, grown = _whole_ones(usual.targets).sum(), _target_area(usual.targets, GROWN_PX)
         for reading in ("dark", "bright"):
             if self.polarity == reading:  # bright targets do not stand on the bright parts
                 continue
             other = _without_feeble(self.detected(reading))
-            area = _target_area(other.targets)
-            if area > most and _two_levels(self.frame, other):
+            area, more = _target_area(other.targets), _whole_ones(other.targets).sum() > whole
+            if area > most and (more or area > grown) and _two_levels(self.frame, other):
                 best, most = other, area
         return best
 
@@ -211,6 +220,8 @@ class _Look:
         *ends, grain = scale_of(self.frame, self.low_dn, self.high_dn)
         margin = int(min(3 + 2 * float(np.median(t.blur_px)), FARTHEST_PX)) if len(t) else 0
         peaks = faint_peaks(self.frame, ground, found.known, self.polarity, self.false_alarms, grain, margin, self.threads)
+        if peaks is None:
+            return replace(found, blanked=True)
         if not len(peaks):
             return found
         table = measure_peaks(self.frame, peaks, Map(ground.level_dn, *ground.scales), (ends[0], ends[1]))
@@ -222,11 +233,12 @@ class _Look:
 
     def without_coder(self, found: Detection) -> Detection:
         """Leave out what a coder of blocks draws, where the frame went through one: of little height, or close to a higher target."""
-        origin = block_origin(self.frame) if len(found.targets) else None
-        if origin is None:
+        coder = self.coder if not isinstance(self.coder, str) else coder_of(self.frame) if len(found.targets) else None
+        if coder is None or not len(found.targets):
             return found
-        targets, left_out = _genuine(found.targets, CODED_RINGING)
-        low = np.abs(targets.amplitude_dn) < coder_height_dn(self.frame, origin, found.background.image())
+        highest = float(np.abs(found.targets.amplitude_dn).max())
+        targets, left_out = _genuine(found.targets, min(max(CODED_RINGING, coder.ringing_dn / highest), MOST_RINGING))
+        low = np.abs(targets.amplitude_dn) < coder_height_dn(self.frame, coder, found.background.image(), targets)
         left_out = LeftOut.joined([found.left_out, left_out, seen_at(targets[low], "no higher than what the coder draws into its blocks")])
         return replace(found, targets=targets[~low], polarity=_polarity(targets[~low]), left_out=left_out)
 
@@ -257,11 +269,17 @@ def _without_feeble(found: Detection) -> Detection:
     return replace(found, targets=t[~feeble], polarity=_polarity(t[~feeble]), left_out=left_out)
 
 
-def _target_area(targets: Regions) -> float:
-    """Area of the whole targets that are discs, ellipses or rings, less that of all else, px²."""
+def _whole_ones(targets: Regions) -> np.ndarray:
+    """Which targets are discs, ellipses or rings that the border does not cut; shape (n,), bool."""
     shaped = select(targets, "ellipse") | (select(targets, "ring") & (targets.holes == 1))  # the ground between targets has many
-    shaped &= targets.flags & np.uint32(Flag.BORDER) == 0
-    return float(np.where(shaped, targets.area_px, -targets.area_px).sum())
+    whole: np.ndarray = shaped & (targets.flags & np.uint32(Flag.BORDER) == 0)
+    return whole
+
+
+def _target_area(targets: Regions, grown_px: float = 0.0) -> float:
+    """Area of the whole targets, with outlines so much farther out, less that of all else, px²."""
+    ring = math.pi * grown_px * (targets.semi_major_px + targets.semi_minor_px + grown_px)
+    return float(np.where(_whole_ones(targets), targets.area_px + ring, -targets.area_px).sum())
 
 
 def _two_levels(frame: np.ndarray, found: Detection) -> bool:

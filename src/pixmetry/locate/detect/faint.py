@@ -37,7 +37,7 @@ def faint_peaks(
     grain_dn: float,
     margin_px: int,
     threads: int | None,
-) -> np.ndarray:
+) -> np.ndarray | None:
     """Find places where more light (or less) than the background's noise can make lies in a patch.
 
     Parameters
@@ -56,7 +56,8 @@ def faint_peaks(
     Returns
     -------
     ndarray, shape (n, 4)
-        x, y, score (over the threshold of its scale, negative for dark) and side of the bin, px; the strongest first.
+        x, y, score (over the threshold of its scale, negative for dark) and side of the bin, px; the strongest first. None where
+        known targets cover more than 40 % of the frame, so that the noise of the rest is not known.
 
     Notes
     -----
@@ -84,7 +85,7 @@ def faint_peaks(
     k.blank_runs(bins, known, margin_px)
     lit = _lit_bins(bins)
     if len(lit) < LEAST_LIT * len(bins.ravel()[:: _step_of(bins)]):
-        return np.empty((0, k.PEAK))
+        return None
     middle = float(lit[len(lit) // 2])  # the skirts of the known targets, and what the scale cuts off, are in the background's map
     if len(known):
         k.fill_blanks(bins, np.float32(middle))

@@ -61,7 +61,9 @@ def no_grid(message: str, rows: int = 0, cols: int = 0) -> Grid:
     return Grid(none, none, none.astype(int), none.astype(int), rows, cols, message)
 
 
-def order_grid(x_px: np.ndarray, y_px: np.ndarray, *, pattern: tuple[int, int] | None = None, asymmetric: bool = False) -> Grid:
+def order_grid(
+    x_px: np.ndarray, y_px: np.ndarray, *, pattern: tuple[int, int] | None = None, asymmetric: bool = False, hexagonal: bool = False
+) -> Grid:
     """Give each of many located dots its row and column on a regular plate, seen in perspective and through a distorting lens.
 
     Parameters
@@ -73,6 +75,8 @@ def order_grid(x_px: np.ndarray, y_px: np.ndarray, *, pattern: tuple[int, int] |
         message says why if none does. Dots of something else beside the plate, which happen to continue its grid, are left out.
     asymmetric : bool
         Every other row is shifted by half a step; row and column are counted as OpenCV does, ``x = 2 col + row % 2``.
+    hexagonal : bool
+        The same, and each dot has six neighbours at one distance: those at its sides are in its row.
 
     Returns
     -------
@@ -106,7 +110,7 @@ def order_grid(x_px: np.ndarray, y_px: np.ndarray, *, pattern: tuple[int, int] |
     index = _grow_best(place)
     if (index[:, 0] > -LARGEST_INDEX).sum() < 4:
         return nothing
-    index, extent, message = _numbered(place, index, pattern, asymmetric)
+    index, extent, message = _numbered(place, index, pattern, asymmetric or hexagonal, hexagonal)
     row, col = nothing.row.copy(), nothing.col.copy()
     row[usable], col[usable] = index.T
     return Grid(x, y, row, col, *extent, message)
@@ -302,7 +306,7 @@ def _without_outliers(place: np.ndarray, index: np.ndarray) -> np.ndarray:
 
 
 def _numbered(
-    place: np.ndarray, index: np.ndarray, pattern: tuple[int, int] | None, asymmetric: bool
+    place: np.ndarray, index: np.ndarray, pattern: tuple[int, int] | None, asymmetric: bool, hexagonal: bool
 ) -> tuple[np.ndarray, tuple[int, int], str]:
     """Choose the axes and the origin of a numbering: (row, col) from 0, its extent (rows, cols), and a message if it differs."""
     known = index[:, 0] > -LARGEST_INDEX
@@ -320,6 +324,8 @@ def _numbered(
         corner = None if pattern is None or asymmetric else _corner(new, pattern)
         image = np.linalg.solve(change.astype(float), np.eye(2)).T @ per_cell  # image step per new row and per new column
         if image[1, 0] * image[0, 1] - image[1, 1] * image[0, 0] <= 0:
+            continue
+        if hexagonal and np.hypot(*image[1]) > np.hypot(*image[0]):  # half the step in a row is 1/√3 of that from row to row
             continue
         fits = corner is not None or (asymmetric and pattern is not None and extent == (pattern[1], pattern[0]))
         area = np.log((np.ptp(new, axis=0) + 1).prod())

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pixmetry.core.errors import InputError
-from pixmetry.locate.detect.detection import THRESHOLD_SIGMA, Regions, seen_at
+from pixmetry.locate.detect.detection import FALSE_ALARMS, THRESHOLD_SIGMA, Regions, seen_at
 from pixmetry.locate.detect.targets import LeftOut, Targets
 
 SAME_PX = 1.0  # two regions of interest that overlap show one target at places that differ by less
@@ -36,6 +36,8 @@ class Limits:
         Least and greatest height over the background, without sign.
     threshold_sigma : float
         Threshold of detection in standard deviations of the background's noise.
+    false_alarms : float
+        Greatest expected number of false faint targets in a frame of noise.
 
     Raises
     ------
@@ -49,6 +51,7 @@ class Limits:
     diameter_px: tuple[float, float] | None = None
     contrast_dn: tuple[float, float] | None = None
     threshold_sigma: float = THRESHOLD_SIGMA
+    false_alarms: float = FALSE_ALARMS
 
     def __post_init__(self) -> None:
         for name in ("diameter_px", "contrast_dn"):
@@ -59,6 +62,8 @@ class Limits:
             raise InputError("no region to look in", where="rois", remedy="name one, or leave them out")
         if not (_is_number(self.threshold_sigma) and 0 < self.threshold_sigma < math.inf):
             raise InputError("a threshold that cannot be used", where="threshold_sigma", value=self.threshold_sigma, allowed="above 0")
+        if not (_is_number(self.false_alarms) and 0 < self.false_alarms < math.inf):
+            raise InputError("no rate of false alarms", where="false_alarms", value=self.false_alarms, allowed="above 0, such as 0.01")
         if self.places_px is not None:
             try:
                 places = np.asarray(self.places_px, float)
@@ -72,7 +77,8 @@ class Limits:
         """Names of those that are not as by default."""
         named = ("rois", "mask", "places_px", "diameter_px", "contrast_dn")
         given = tuple(name for name in named if getattr(self, name) is not None)
-        return given + (("threshold_sigma",) if self.threshold_sigma != THRESHOLD_SIGMA else ())
+        given += ("threshold_sigma",) if self.threshold_sigma != THRESHOLD_SIGMA else ()
+        return given + (("false_alarms",) if self.false_alarms != FALSE_ALARMS else ())
 
     def boxes(self, shape: tuple[int, int]) -> list[tuple[int, int, int, int]]:
         """The regions of interest as first row, stop row, first column, stop column; the whole frame if there are none.
@@ -168,7 +174,18 @@ def _at_places(targets: Targets, places: np.ndarray) -> np.ndarray:
     return of
 
 
-def detect_within(frame: np.ndarray, limits: Limits, look: Callable[[np.ndarray], Any]) -> tuple[Regions, LeftOut, set[str], set[str]]:
+class Within(NamedTuple):
+    """What was detected in the regions of interest."""
+
+    targets: Regions  # what the border of a region cuts is not among them, nor is one twice
+    seen: Regions  # all, cut ones too: what is no ground
+    left_out: LeftOut
+    polarities: set[str]
+    grounds: set[str]  # "dark" and "bright", the parts that were taken as the ground where targets cover a region
+    blanked: bool  # whether targets cover so much of one that no faint ones were looked for
+
+
+def detect_within(frame: np.ndarray, limits: Limits, look: Callable[[np.ndarray, int, int], Any]) -> Within:
     """Detect in each region of interest; places are those of the whole frame.
 
     Parameters
@@ -176,30 +193,26 @@ def detect_within(frame: np.ndarray, limits: Limits, look: Callable[[np.ndarray]
     frame : ndarray, shape (rows, cols)
     limits : Limits
     look : callable
-        From a part of the frame to a `Detection`.
+        From a part of the frame, and the row and column where it begins, to a `Detection`.
 
     Returns
     -------
-    Regions
-        What the border of a region of interest cuts is not among them, nor is one twice.
-    LeftOut
-    set of str
-        Polarities that were found.
-    set of str
-        "dark" and "bright", the parts that were taken as the ground where targets cover a region.
+    Within
     """
-    parts, left_out, polarities, grounds = [], [], set(), set()
+    parts, seen, left_out, polarities, grounds, blanked = [], [], [], set(), set(), False
     for top, bottom, left, right in limits.boxes((frame.shape[0], frame.shape[1])):
         whole = (bottom - top, right - left) == frame.shape
-        found = look(frame if whole else np.ascontiguousarray(frame[top:bottom, left:right]))
+        found = look(frame if whole else np.ascontiguousarray(frame[top:bottom, left:right]), top, left)
         t = found.targets
         polarities.add(found.polarity)
         grounds |= {found.reading} - {""}
+        blanked |= found.blanked
         lost = replace(found.left_out, x_px=found.left_out.x_px + left, y_px=found.left_out.y_px + top)
         t = replace(
             t, x_px=t.x_px + left, y_px=t.y_px + top, row_first=t.row_first + top, row_stop=t.row_stop + top, col_first=t.col_first + left,
             col_stop=t.col_stop + left,
         )  # fmt: skip
+        seen.append(t)
         if not whole:
             near = (t.row_first - 2 < top) & (top > 0) | (t.row_stop + 2 > bottom) & (bottom < frame.shape[0])
             near |= (t.col_first - 2 < left) & (left > 0) | (t.col_stop + 2 > right) & (right < frame.shape[1])
@@ -207,13 +220,17 @@ def detect_within(frame: np.ndarray, limits: Limits, look: Callable[[np.ndarray]
             t = t[~near]
         parts.append(t)
         left_out.append(lost)
-    targets = Regions(**{f.name: np.concatenate([getattr(t, f.name) for t in parts]) for f in fields(Regions)})
+
+    def in_one(tables: list[Regions]) -> Regions:
+        return Regions(**{f.name: np.concatenate([getattr(t, f.name) for t in tables]) for f in fields(Regions)})
+
+    targets, all_seen = in_one(parts), in_one(seen)
     if len(parts) > 1 and len(targets) > 1:
         from scipy.spatial import cKDTree
 
         pairs = cKDTree(np.column_stack([targets.x_px, targets.y_px])).query_pairs(SAME_PX, output_type="ndarray")
         targets = targets[np.setdiff1d(np.arange(len(targets)), pairs[:, 1])]
-    return targets, _nowhere_whole(LeftOut.joined(left_out), targets), polarities, grounds
+    return Within(targets, all_seen, _nowhere_whole(LeftOut.joined(left_out), targets), polarities, grounds, blanked)
 
 
 def _nowhere_whole(lost: LeftOut, targets: Regions) -> LeftOut:

@@ -22,7 +22,7 @@ DICTIONARIES = (
 )  # fmt: skip
 GRID_BORDERS = (2, 1)  # bits of the black border of a tag: Kalibr prints two, everyone else one
 LEAST_TAGS = 4
-LEAST_CORNERS = 6
+LEAST_CORNERS, LEAST_TWICE = 6, 2
 AROUND = 8  # corners or tags through which the place of one is expected
 MOST_OFF = 0.25  # of the pitch, from there
 TAG_CORNERS = np.array([(0, 0), (0, 1), (1, 1), (1, 0)])  # (row, col), round a tag as x turns to y
@@ -112,13 +112,33 @@ def find_charuco(frame: np.ndarray, squares: tuple[int, int], marker: float, dic
         place, (row, col) = np.asarray(corners, float).reshape(-1, 2), np.divmod(np.asarray(numbers).ravel(), cols - 1)
         best = Grid(place[:, 0], place[:, 1], row, col, rows - 1, cols - 1)
     if best.message:
-        return best
+        return with_reason(best, grey, table, GRID_BORDERS[1:])
     good = on_one_board(np.stack([best.row, best.col], axis=1), np.stack([best.x_px, best.y_px], axis=1))
     if good.sum() < LEAST_CORNERS:
         return no_grid(
             f"{int(good.sum())} of {len(best)} corners with numbers lie as on one board, {LEAST_CORNERS} are needed", rows - 1, cols - 1
         )
     return Grid(best.x_px[good], best.y_px[good], best.row[good], best.col[good], rows - 1, cols - 1)
+
+
+def with_reason(nothing: Grid, grey: np.ndarray, table: Any, borders: tuple[int, ...]) -> Grid:
+    """An empty grid, whose message says so where markers are seen twice, or can be read in the mirror image of the frame."""
+    cv2 = import_extra("cv2")
+    for border in borders:
+        how = cv2.aruco.DetectorParameters()
+        how.markerBorderBits = border
+        detector = cv2.aruco.ArucoDetector(table, how)
+        _, numbers, _ = detector.detectMarkers(grey)
+        twice = 0 if numbers is None else len(numbers) - len(np.unique(numbers))
+        _, mirrored, _ = detector.detectMarkers(np.ascontiguousarray(grey[:, ::-1]))
+        what = ""
+        if twice >= LEAST_TWICE:
+            what = f"{twice} of its markers are seen twice: a second board is in view"
+        elif mirrored is not None and len(mirrored) >= LEAST_TAGS:
+            what = f"{len(mirrored)} of its markers in the mirror image: the picture is mirrored"
+        if what:
+            return no_grid(f"{nothing.message}, but {what}", nothing.rows, nothing.cols)
+    return nothing
 
 
 def find_tag_grid(frame: np.ndarray, tags: tuple[int, int], side: tuple[float, float], dictionary: str) -> tuple[Grid, bool]:
@@ -164,7 +184,7 @@ def find_tag_grid(frame: np.ndarray, tags: tuple[int, int], side: tuple[float, f
     use = np.isin(number, unique[count == 1]) & (number < cols * rows)
     number, corner = number[use], corner[use]
     if len(number) < LEAST_TAGS:
-        return nothing, False
+        return with_reason(nothing, grey, table, GRID_BORDERS), False
     cells, centre = np.stack(np.divmod(number, cols), axis=1).astype(float), corner.mean(axis=1)
     design = np.column_stack([cells, np.ones(len(cells))])
     if np.linalg.matrix_rank(design) < 3:

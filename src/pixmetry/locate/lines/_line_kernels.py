@@ -359,7 +359,8 @@ def fit_lines(frame: NDArray[np.generic], first: int, stop: int, how: How, candi
         place, start, reach = lines.places[i], candidates.start[i], candidates.reach[i]
         half, curve = max(place[4], -place[3]), place[5]
         tall, wide = 2.0 * reach + 2.0, place[4] - place[3] + 2.0
-        room = int(min(tall * wide * (1.0 + 0.5 * (curve * half) ** 2) + 4.0 * (tall + wide), 1.0 * frame.size)) + 16
+        area = tall * wide * (1.0 + 0.5 * (curve * half) ** 2) + 4.0 * (tall + wide)
+        room = int(min(max(area, 0.0), 1.0 * frame.size)) + 16  # a line that lies outside the frame has a negative length there
         all_pixels = Pixels(np.empty(room), np.empty(room), np.empty(room))
         n, met = gather(frame, place, reach, i, lines, (noise.low_dn, noise.high_dn), all_pixels)
         pixels = Pixels(all_pixels.x[:n], all_pixels.y[:n], all_pixels.value[:n])

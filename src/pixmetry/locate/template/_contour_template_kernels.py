@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pixmetry.core._normal_kernels import both, cdf, pdf
-from pixmetry.core.arrays import Array, Singles
+from pixmetry.core.arrays import Array, Ints, Singles
 from pixmetry.core.jit import jit
 
 DISC, ELLIPSE, RING, SPOT = 0, 1, 2, 3
@@ -326,22 +326,27 @@ def draw_planes(images: Array, canvas: Canvas, kind: int, p: Array, aperture: fl
 
 
 @jit
-def draw_plain(images: Array, canvas: Canvas, kind: int, p: Array, aperture: float) -> None:
-    """`draw` and `complete` in one, where neither background nor light have a slope among the unknowns."""
+def draw_plain(images: Array, spans: Ints, canvas: Canvas, kind: int, p: Array, aperture: float) -> None:
+    """`draw` and `complete` in one, of the pixels in the spans, row after row, where no slopes are among the unknowns; not of a spot.
+
+    ``images``, shape (parameters + 1, 1, pixels); ``spans``, shape (rows, 2): first and stop column.
+    """
     k = SHAPES[kind] + 3
-    if kind == SPOT:
-        draw(images, canvas, kind, p, aperture, False, False)
-        complete(images, kind, p, False, False)
-        return
     draw_planes(images, canvas, kind, p, aperture, False)
     planes, amplitude, background = canvas.planes, p[k], p[k + 1]
-    for r in range(images.shape[1]):
-        for c in range(images.shape[2]):
-            at = 8 * (c + PAD)
-            f = planes[r, at] + (images[k + 1, r - 1, c] if r > 0 else 0.0)
-            images[k + 1, r, c], images[0, r, c], images[k + 2, r, c] = f, background + amplitude * f, 1.0
-            for j in range(1, k + 1):
-                images[j, r, c] = amplitude * planes[r, at + j]
+    f, n = np.zeros(planes.shape[1] // 8 - 2 * PAD), 0
+    for r in range(len(spans)):
+        row, first, wide = planes[r], spans[r, 0], spans[r, 1] - spans[r, 0]
+        for c in range(len(f)):
+            f[c] += row[8 * (c + PAD)]
+        mean, seen, level = images[0, 0, n : n + wide], images[k + 1, 0, n : n + wide], images[k + 2, 0, n : n + wide]
+        for c in range(wide):
+            seen[c], mean[c], level[c] = f[first + c], background + amplitude * f[first + c], 1.0
+        for j in range(1, k + 1):
+            out, at = images[j, 0, n : n + wide], 8 * (first + PAD) + j
+            for c in range(wide):
+                out[c] = amplitude * row[at + 8 * c]
+        n += wide
 
 
 @jit

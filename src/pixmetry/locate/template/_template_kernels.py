@@ -39,6 +39,8 @@ PATIENCE = 6  # steps after which only the place must be at rest, and χ² hardl
 HARDLY = 0.5
 LEAST_BLUR_PX = 0.1
 LEAST_RADIUS_PX = 0.2
+LARGE = 2.5  # half axis over the edge's standard deviation from which the edge is as good as straight
+CLEAR = 20.0  # height over the noise from which the sums tell more than a rough look
 SMALL = 2.0  # half axis over blur below which they can hardly be told apart
 VAGUE = 0.5  # relative standard deviation at which radius and blur are held where the image does not tell them apart
 RIDGE = 1e-12  # damping that is always there
@@ -105,6 +107,13 @@ class Window(NamedTuple):
     residual: Array
 
 
+class Pixels(NamedTuple):
+    """Where the pixels of a window in work are, which are those of its spans, row after row; in work it has one row."""
+
+    spans: Ints  # shape (rows, 2): first and stop column
+    whole: Array  # shape (parameters + 1, rows, cols): where images are drawn that need their neighbours; else empty
+
+
 class System(NamedTuple):
     """Normal equations and what is needed to solve them."""
 
@@ -113,13 +122,13 @@ class System(NamedTuple):
     factor: Factor
     right: Array
     step: Array
-    scratch: Array  # shape (pixels,)
+    scratch: Array  # shape (2, pixels)
 
 
 @jit
 def system_for(pixels: int) -> System:
     """Room for the equations of a window."""
-    return System(np.zeros((MOST, MOST)), np.zeros(MOST), factor_for(MOST), np.zeros(MOST), np.zeros(MOST), np.empty(pixels))
+    return System(np.zeros((MOST, MOST)), np.zeros(MOST), factor_for(MOST), np.zeros(MOST), np.zeros(MOST), np.empty((2, pixels)))
 
 
 @jit(**DOT)
@@ -237,19 +246,36 @@ def mean_range(kind: int, p: Array) -> tuple[float, float]:
     return min(p[k + 1], p[k + 1] + p[k]) - margin, max(p[k + 1], p[k + 1] + p[k]) + margin
 
 
+@jit(**DOT)
+def dots(a: Array, b: Array, c: Array, d: Array) -> tuple[float, float, float, float]:
+    """Sums of the products a c, a d, b c, b d; each number is loaded once for two of them."""
+    ac, ad, bc, bd = 0.0, 0.0, 0.0, 0.0
+    for i in range(len(a)):
+        ac += a[i] * c[i]
+        ad += a[i] * d[i]
+        bc += b[i] * c[i]
+        bd += b[i] * d[i]
+    return ac, ad, bc, bd
+
+
 @jit
 def normal_equations(images: Array, residual: Array, weight: Array, used: Ints, first: int, system: System) -> None:
     """Fill JᵀWJ and JᵀW · residual for the ``used`` parameters, from the ``first`` on; the images hold the derivatives."""
-    size = weight.size
+    size, count = weight.size, len(used)
     w, d = weight.reshape(size), residual.reshape(size)
     normal, gradient, scratch = system.normal, system.gradient, system.scratch
-    for a in range(first, len(used)):
-        column = images[1 + used[a]].reshape(size)
+    one, two = scratch[0, :size], scratch[1, :size]
+    for a in range(first, count, 2):
+        e = min(a + 1, count - 1)
+        here, next_one = images[1 + used[a]].reshape(size), images[1 + used[e]].reshape(size)
         for i in range(size):
-            scratch[i] = w[i] * column[i]
-        for b in range(a + 1):
-            normal[a, b] = normal[b, a] = dot(scratch[:size], images[1 + used[b]].reshape(size))
-        gradient[a] = dot(scratch[:size], d)
+            one[i], two[i] = w[i] * here[i], w[i] * next_one[i]
+        for b in range(0, e + 1, 2):
+            f = min(b + 1, e)
+            products = dots(one, two, images[1 + used[b]].reshape(size), images[1 + used[f]].reshape(size))
+            normal[a, b], normal[a, f], normal[e, b], normal[e, f] = products
+            normal[b, a], normal[f, a], normal[b, e], normal[f, e] = products
+        gradient[a], gradient[e] = dot(one, d), dot(two, d)
 
 
 @jit
@@ -269,23 +295,26 @@ def cut_out(frame: NDArray[np.generic], about: About, noise: Noise, which: Ints,
         col0, row0 = int(round(x0)) - half[i], int(round(y0)) - half[i]
         far = outer[i] + reach[i, 0]
         used, cut, top, bottom = 0, 0.0, 0, 0
+        near = near_index[near_start[i] : near_start[i + 1]]
         k = place[w]
+        data[k : k + side * wide], mask[k : k + side * wide] = 0.0, 0.0
         for r in range(side):
             y = row0 + r
-            for c in range(wide):
+            dy = y - y0
+            half_row = math.sqrt(max(far * far - dy * dy, 0.0)) + 1.0
+            for c in range(max(int(x0 - half_row) - col0, 0), min(int(x0 + half_row) + 2 - col0, side)):
                 x = col0 + c
-                data[k + c], mask[k + c] = 0.0, 0.0
-                dx, dy = x - x0, y - y0
-                if c >= side or dx * dx + dy * dy > far * far:
+                dx = x - x0
+                if dx * dx + dy * dy > far * far:
                     continue
                 if y < 0 or x < 0 or y >= frame.shape[0] or x >= frame.shape[1]:
                     cut = 1.0
                     continue
                 own = True
-                for n in range(near_start[i], near_start[i + 1]):
-                    j = near_index[n]
-                    e = math.hypot(x - start[j, 0], y - start[j, 1]) - outer[j]
-                    if e < reach[j, 1] or e < math.hypot(dx, dy) - outer[i]:
+                for j in near:
+                    ex, ey = x - start[j, 0], y - start[j, 1]
+                    e = math.sqrt(ex * ex + ey * ey) - outer[j]
+                    if e < reach[j, 1] or e < math.sqrt(dx * dx + dy * dy) - outer[i]:
                         own = False
                         break
                 if own:
@@ -450,18 +479,20 @@ def falls_with(system: System, chosen: Ints, small: Array) -> float:
 
 
 @jit
-def add_planes(images: Array, p: Array, count: int) -> None:
-    """Derivatives by the slopes of background and light, where these are 0.
+def add_planes(images: Array, spans: Ints, p: Array, count: int) -> None:
+    """Derivatives by the slopes of background and light, where these are 0; ``images`` of the pixels in the spans, in one row.
 
     Light on the surface differs from light on the image, which this is, by a shift, which is among the unknowns.
     """
-    for r in range(images.shape[1]):
-        dy = r - p[1]
-        for c in range(images.shape[2]):
-            dx = c - p[0]
-            light = p[count - 2] * images[count - 1, r, c]
-            images[count + 1, r, c], images[count + 2, r, c] = dx * images[count, r, c], dy * images[count, r, c]
-            images[count + 3, r, c], images[count + 4, r, c] = dx * light, dy * light
+    n = 0
+    for r in range(len(spans)):
+        dy, left, wide = r - p[1], spans[r, 0] - p[0], spans[r, 1] - spans[r, 0]
+        part = images[:, 0, n : n + wide]
+        for c in range(wide):
+            dx, light = left + c, p[count - 2] * part[count - 1, c]
+            part[count + 1, c], part[count + 2, c] = dx * part[count, c], dy * part[count, c]
+            part[count + 3, c], part[count + 4, c] = dx * light, dy * light
+        n += wide
 
 
 @jit
@@ -485,18 +516,58 @@ class Course(NamedTuple):
 
 
 @jit
-def draw_mean(window: Window, canvas: Canvas, model: Model, p: Array, planes: tuple[bool, bool]) -> None:
+def draw_mean(images: Array, pixels: Pixels, canvas: Canvas, model: Model, p: Array, planes: tuple[bool, bool]) -> None:
     """Draw the mean and its derivatives; ``planes``: whether those of background and light are unknown."""
-    if planes[0] or planes[1]:
-        draw(window.images, canvas, model.kind, p, model.aperture, planes[1], model.surface)
-        complete(window.images, model.kind, p, planes[1], model.surface)
-    else:
-        draw_plain(window.images, canvas, model.kind, p, model.aperture)
+    spans, whole = pixels
+    if whole.size == 0:
+        draw_plain(images, spans, canvas, model.kind, p, model.aperture)
+        return
+    draw(whole, canvas, model.kind, p, model.aperture, planes[1], model.surface)
+    complete(whole, model.kind, p, planes[1], model.surface)
+    n = 0
+    for r in range(len(spans)):
+        wide = spans[r, 1] - spans[r, 0]
+        images[:, 0, n : n + wide] = whole[:, r, spans[r, 0] : spans[r, 1]]
+        n += wide
+
+
+@jit
+def span_rows(mask: Singles, spans: Ints) -> int:
+    """Write the columns from the first to behind the last that is used, for every row; return how many pixels that makes."""
+    total = 0
+    for r in range(len(mask)):
+        first, stop = 0, 0
+        for c in range(mask.shape[1]):
+            if mask[r, c] != 0.0:
+                if stop == 0:
+                    first = c
+                stop = c + 1
+        spans[r, 0], spans[r, 1] = first, stop
+        total += stop - first
+    return total
+
+
+@jit
+def in_one_row(image: Singles, spans: Ints) -> None:
+    """Move the pixels of the spans to the beginning of an image, row after row."""
+    flat, n = image.reshape(image.size), 0
+    for r in range(len(spans)):
+        for c in range(spans[r, 0], spans[r, 1]):
+            flat[n] = image[r, c]
+            n += 1
 
 
 @jit
 def approach(
-    window: Window, canvas: Canvas, model: Model, p: Array, found: Array, used: Ints, limits: tuple[float, float, float], system: System
+    window: Window,
+    pixels: Pixels,
+    canvas: Canvas,
+    model: Model,
+    p: Array,
+    found: Array,
+    used: Ints,
+    limits: tuple[float, float, float],
+    system: System,
 ) -> Course:
     """Fit one target from p, which becomes the parameters that were looked at last, those of the images and kept weights.
 
@@ -518,7 +589,7 @@ def approach(
         good = allowed(kind, trial, begin, largest, broadest)
         if good:
             now = Window(window.images, window.data, window.mask, weight, kept, window.residual)
-            draw_mean(now, canvas, model, trial, (ground, light))
+            draw_mean(now.images, pixels, canvas, model, trial, (ground, light))
             squares, before, after = weigh(now, noise, model.efficiency, *mean_range(kind, trial))
             held = strain(kind, trial, begin)
             good = before + held <= merit + strained + 1e-4 * chi2 + 0.02  # the template is not smoother than this
@@ -558,7 +629,7 @@ def approach(
 
 
 @jit
-def spread_of(window: Window, used: Ints, noise: Noise, system: System, fits: Fits, i: int) -> None:
+def spread_of(window: Window, spans: Ints, used: Ints, noise: Noise, system: System, fits: Fits, i: int) -> None:
     """Variances and covariance of target i from its normal equations, and what rows do that are shifted."""
     count, variance, covariance = len(used), fits.variance[i], fits.covariance[i]
     if factorise(system.normal, count, RIDGE, system.factor):
@@ -571,18 +642,68 @@ def spread_of(window: Window, used: Ints, noise: Noise, system: System, fits: Fi
                 covariance[a], covariance[1 + a] = system.right[0], system.right[1]
     fits.quality[i, 9] = max(covariance[0], covariance[2])
     if noise.row_shift_px2 > 0.0 or noise.field_shift_px2 > 0.0:
-        rows = window.weight.shape[0]
-        answers = np.empty((rows, MOST))
-        if row_answers(window.images, window.kept, used, system, (0, rows), answers):
+        answers, n = np.zeros((len(spans), MOST)), 0
+        if factorise(system.normal, count, RIDGE, system.factor):
+            for r in range(len(spans)):
+                wide = spans[r, 1] - spans[r, 0]
+                row_answer(window.images[:, 0, n : n + wide], window.kept[0, n : n + wide], used, system, answers[r])
+                n += wide
             add_row_shifts(answers, used, noise, variance, covariance)
 
 
 @jit
-def fit(model: Model, start: Array, free: NDArray[np.bool_], test: bool, about: About, which: Ints, packed: Packed, fits: Fits) -> None:
+def better_start(kind: int, window: Window, noise: Noise, aperture: float, p: Array) -> None:
+    """Put size, blur and height that the sums of the heights, of their squares and cubes tell in place of rough ones.
+
+    With f the share of the light, Σ f = F, the area; Σ f² = F − q and Σ f³ = F − 3q/2 with q = σL/√π, L the outline's length and σ the
+    edge's standard deviation, for ∫ Φ (1 − Φ) = 1/√π. Of discs and ellipses that are much larger than their blur and
+    stand clear of the noise.
+    """
+    s = SHAPES[kind]
+    if s != 1 and s != 3:
+        return
+    area = p[2] * p[2] if s == 1 else p[2] * p[3] - p[4] * p[4]
+    long = longest_px(kind, p)
+    short = area / long
+    if short < LARGE * math.hypot(p[2 + s], 0.3 * aperture):
+        return
+    sign, height, ground = math.copysign(1.0, p[3 + s]), abs(p[3 + s]), p[4 + s]
+    data, mask = window.data[0], window.mask[0]
+    n, first, second, third = 0.0, 0.0, 0.0, 0.0
+    for i in range(len(data)):
+        h = sign * mask[i] * (data[i] - ground)
+        n += mask[i]
+        first += h
+        second += h * h
+        third += h * h * h
+    variance, rise = variance_of(max(ground - noise.black_dn, 0.0), noise), sign * noise.slope_dn
+    if height * height < CLEAR * CLEAR * variance:
+        return
+    third -= 3.0 * (variance * first + rise * second)
+    second -= n * variance + rise * first
+    root = 2.25 * second * second - 2.0 * first * third
+    if not (first > 0.0 and root > 0.0):
+        return
+    top = (1.5 * second - math.sqrt(root)) / first
+    if not 0.7 * height < top < 1.4 * height:
+        return
+    grown, deficit = math.sqrt(first / (top * math.pi * area)), first / top - second / (top * top)
+    around = math.pi * grown * (3.0 * (long + short) - math.sqrt((3.0 * long + short) * (long + 3.0 * short)))
+    edge = deficit * math.sqrt(math.pi) / around
+    if not (0.8 < grown < 1.25 and edge > 0.3 and LARGE * edge < short):
+        return
+    p[2 : 2 + s] *= grown
+    p[2 + s], p[3 + s] = math.sqrt(max(edge * edge - aperture * aperture / 12.0, 0.04)), sign * top
+
+
+@jit
+def fit(
+    model: Model, start: Array, rough: bool, free: NDArray[np.bool_], test: bool, about: About, which: Ints, packed: Packed, fits: Fits
+) -> None:
     """Fit the template to the targets ``which``, whose windows `cut_out` has packed.
 
-    ``start``, shape (n, parameters). ``free``: which parameters are unknown, the base and perhaps planes. ``test``: whether to test planes,
-    none of which is free then.
+    ``start``, shape (n, parameters); ``rough``: whether it is as detected. ``free``: which parameters are unknown, the base and perhaps
+    planes. ``test``: whether to test planes, none of which is free then.
     """
     kind, parameters = model.kind, start.shape[1]
     s = SHAPES[kind]
@@ -594,6 +715,8 @@ def fit(model: Model, start: Array, free: NDArray[np.bool_], test: bool, about: 
         broadest = max(broadest, start[i, 2 + s])
     largest, broadest = 2.0 * longest + 2.0, 2.5 * broadest + 0.5
     blocks = block_count(reach_px(broadest, model.aperture))
+    in_whole = kind == SPOT or parameters - np.count_nonzero(free) != 4  # of which draw_plain draws nothing
+    store_whole, store_spans = np.zeros((parameters + 1) * most if in_whole else 0), np.empty((side, 2), np.int64)
     store_planes = np.empty(side * 8 * ((side + 7) // 8 * 8 + 2 * PAD), np.float32)
     store, store_residual = np.empty((parameters + 1) * most), np.empty(most)
     store_weight, store_kept = np.empty(most), np.empty(most)
@@ -611,13 +734,19 @@ def fit(model: Model, start: Array, free: NDArray[np.bool_], test: bool, about: 
         side = 2 * half + 1
         wide = (side + 7) // 8 * 8
         size, first = side * wide, packed.place[w]
+        data, mask = packed.data[first : first + size], packed.mask[first : first + size]
+        whole = store_whole[: (parameters + 1) * size].reshape(parameters + 1, side, wide) if in_whole else store_whole.reshape(0, 0, 0)
+        pixels = Pixels(store_spans[:side], whole)
+        n = span_rows(mask.reshape(side, wide), pixels.spans)
+        in_one_row(data.reshape(side, wide), pixels.spans)
+        in_one_row(mask.reshape(side, wide), pixels.spans)
         window = Window(
-            store[: (parameters + 1) * size].reshape(parameters + 1, side, wide),
-            packed.data[first : first + size].reshape(side, wide),
-            packed.mask[first : first + size].reshape(side, wide),
-            store_weight[:size].reshape(side, wide),
-            store_kept[:size].reshape(side, wide),
-            store_residual[:size].reshape(side, wide),
+            store[: (parameters + 1) * n].reshape(parameters + 1, 1, n),
+            data[:n].reshape(1, n),
+            mask[:n].reshape(1, n),
+            store_weight[:n].reshape(1, n),
+            store_kept[:n].reshape(1, n),
+            store_residual[:n].reshape(1, n),
         )
         canvas = Canvas(store_planes[: side * 8 * (wide + 2 * PAD)].reshape(side, 8 * (wide + 2 * PAD)), points, table, across, down, parts)
         col0, row0 = int(round(about.home[i, 0])) - half, int(round(about.home[i, 1])) - half
@@ -628,7 +757,11 @@ def fit(model: Model, start: Array, free: NDArray[np.bool_], test: bool, about: 
         quality[i, 0], quality[i, 2:5], quality[i, 5] = math.nan, 0.0, -1.0
         if quality[i, 1] <= count:
             continue
-        chi2, falls, steps, at_rest = approach(window, canvas, model, p, fits.parameters[i], used, (largest, broadest, darkest), system)
+        if rough and quality[i, 6] == 0.0 and quality[i, 7] == 0.0 and quality[i, 8] == 0.0:
+            better_start(kind, window, model.noise, model.aperture, p)
+        chi2, falls, steps, at_rest = approach(
+            window, pixels, canvas, model, p, fits.parameters[i], used, (largest, broadest, darkest), system
+        )
         if math.isinf(chi2):
             fits.parameters[i] = math.nan
             continue
@@ -637,27 +770,22 @@ def fit(model: Model, start: Array, free: NDArray[np.bool_], test: bool, about: 
         quality[i, 0], quality[i, 5] = chi2 - max(falls, 0.0), steps if at_rest else -steps
         if not at_rest:
             continue
-        spread_of(window, used, model.noise, system, fits, i)
+        spread_of(window, pixels.spans, used, model.noise, system, fits, i)
         if test:
-            add_planes(window.images, p, count)
+            add_planes(window.images, pixels.spans, p, count)
             normal_equations(window.images, window.residual, window.kept, every, count, system)
             test_planes(system, count, quality[i])
 
 
 @jit
-def row_answers(images: Array, weight: Array, used: Ints, system: System, span: tuple[int, int], out: Array) -> bool:
-    """How the unknowns answer to a shift of each row along x: N⁻¹ Jᵀ W ∂µ/∂x over the row; rows of the span of ``out``."""
-    count = len(used)
-    if not factorise(system.normal, count, RIDGE, system.factor):
-        return False
-    for r in range(span[0], span[1]):
-        for a in range(count):
-            total = 0.0
-            for c in range(weight.shape[1]):
-                total += weight[r, c] * images[1, r, c] * images[1 + used[a], r, c]
-            out[r, a] = total
-        substitute(system.factor, count, out[r], out[r])
-    return True
+def row_answer(images: Array, weight: Array, used: Ints, system: System, out: Array) -> None:
+    """How the unknowns answer to a shift of a row along x: N⁻¹ Jᵀ W ∂µ/∂x over the row; the system holds the factor of N."""
+    for a in range(len(used)):
+        total = 0.0
+        for c in range(len(weight)):
+            total += weight[c] * images[1, c] * images[1 + used[a], c]
+        out[a] = total
+    substitute(system.factor, len(used), out, out)
 
 
 @jit
@@ -741,7 +869,7 @@ def residuals(
         if rows:
             row_scores(window, used, system, scores[w], spread[w])
             continue
-        leverages(images, weight, inverse, count, system.scratch, kept)
+        leverages(images, weight, inverse, count, system.scratch[0], kept)
         for r in range(side):
             for c in range(side):
                 if window.mask[r, c] == 0.0:
@@ -885,8 +1013,10 @@ def row_scores(window: Window, used: Ints, system: System, scores: Array, spread
     first = max(0, (side - ROWS) // 2)
     stop = min(side, first + ROWS)
     answers = np.zeros((side, MOST))
-    if not row_answers(images, weight, used, system, (first, stop), answers):
+    if not factorise(system.normal, len(used), RIDGE, system.factor):
         return
+    for r in range(first, stop):
+        row_answer(images[:, r], weight[r], used, system, answers[r])
     for r in range(first, stop):
         for c in range(side):
             scores[r - first] += weight[r, c] * images[1, r, c] * residual[r, c]

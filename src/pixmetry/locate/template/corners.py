@@ -27,6 +27,8 @@ LEAST_SQUARE_PX = 4
 SLIP_PX, SLIP_SQUARES = 2.0, 0.1
 SLIP_AROUND = 12
 LEAST_ALTERNATION = 0.5  # of the squares' colours, agreeing less disagreeing
+BESIDE, CLEAR_COLOUR = 0.3, 0.2  # squares, from a corner to where its four are looked at; of the contrast, between dark and bright there
+RIM_SHARE = 0.5  # of the corners of an outermost row or column, at which four squares must meet
 CHUNK = 64
 OTHER_STARTS_PX = ((0.8, 0.0), (-0.8, 0.0), (0.0, 0.8), (0.0, -0.8))
 
@@ -115,7 +117,9 @@ def numbered_by_colours(frame: np.ndarray, grid: Grid) -> Grid:
 
     Notes
     -----
-    A square counts as dark or bright by the sign of its grey value less the mean of the squares beside it.
+    A square counts as dark or bright by the sign of its grey value less the mean of the squares beside it. At half of the corners of each
+    outermost row and column four squares must meet: OpenCV's finders complete a board that the frame cuts with the outline of its squares,
+    and would count from there.
     """
     rows, cols = grid.rows, grid.cols
     place = np.stack([grid.x_px, grid.y_px], axis=1).reshape(rows, cols, 2)
@@ -127,6 +131,10 @@ def numbered_by_colours(frame: np.ndarray, grid: Grid) -> Grid:
     score = [float((square_colours(frame, board) * chessboard_colours(rows - 1, cols - 1)).mean()) for board in shaped]
     if max(score) < LEAST_ALTERNATION:
         return no_grid(f"the squares of what looks like {cols} × {rows} inner corners do not alternate between dark and bright", rows, cols)
+    meet = crossing_corners(frame, place)
+    if min(meet[0].mean(), meet[-1].mean(), meet[:, 0].mean(), meet[:, -1].mean()) < RIM_SHARE:
+        what = f"part of a chessboard was found: {cols} × {rows} inner corners, but in an outermost row or column"
+        return no_grid(f"{what} no four squares meet; part of a board cannot be numbered", rows, cols)
     steps = [np.diff(board, axis=1).mean(axis=(0, 1)) for board in shaped]
     # towards x, or towards y where x leaves a tie
     best = max(range(len(shaped)), key=lambda k: (score[k] > 0, round(steps[k][0] / np.hypot(*steps[k]), 6), steps[k][1]))
@@ -144,6 +152,19 @@ def square_colours(frame: np.ndarray, place: np.ndarray) -> np.ndarray:
     around = np.stack([beside[:-2, 1:-1], beside[2:, 1:-1], beside[1:-1, :-2], beside[1:-1, 2:]])
     colours: np.ndarray = np.sign(np.nanmean(around, axis=0) - grey)
     return colours
+
+
+def crossing_corners(frame: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """At which corners two dark squares meet two bright ones crosswise, boolean, shape (rows, cols) as ``place`` of (rows, cols, 2)."""
+    across, down = BESIDE * np.gradient(place, axis=1), BESIDE * np.gradient(place, axis=0)
+    four = np.stack([place - across - down, place + across + down, place + across - down, place - across + down])
+    x, y = np.rint(four[..., 0]).astype(int), np.rint(four[..., 1]).astype(int)
+    inside = (x >= 0) & (y >= 0) & (x < frame.shape[1]) & (y < frame.shape[0])
+    grey = np.where(inside, frame[np.clip(y, 0, frame.shape[0] - 1), np.clip(x, 0, frame.shape[1] - 1)], np.nan).astype(float)
+    gap = np.maximum(grey[:2].min(axis=0) - grey[2:].max(axis=0), grey[2:].min(axis=0) - grey[:2].max(axis=0))
+    contrast = np.nanmedian(np.abs(grey[:2].mean(axis=0) - grey[2:].mean(axis=0)))
+    crossing: np.ndarray = gap > CLEAR_COLOUR * contrast  # NaN is no crossing
+    return crossing
 
 
 def chessboard_colours(rows: int, cols: int) -> np.ndarray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from pixmetry.locate.detect.background import scale_of
 from pixmetry.locate.detect.targets import Targets
 from pixmetry.locate.noise import ROUNDING_DN2, NoiseModel
 from pixmetry.locate.template._template_kernels import ALIKE, residuals
-from pixmetry.locate.template.template_fit import Windows, run_fit, with_second_start
+from pixmetry.locate.template.template_fit import Fitted, Windows, run_fit, with_second_start
 
 PIECES = 4  # of the work
 LEAST_SLOPED_PX = 2.0
@@ -21,7 +22,7 @@ MOST_TARGETS = 64
 EDGE_PX = 0.05  # misplacement of an edge that a template may have: where it would matter, a pixel says nothing about noise
 LEVELS = 32
 PASSES = 4  # each with better weights, and a better idea of which pixels are flat
-SETTLED = 1.2  # ratio of variances from which another pass is made
+SETTLED, AT_ONCE = 1.2, 1.1  # ratio of variances from which another pass is made; and after the first pass, which changes most
 LEAST_PIXELS = 4
 MANY_PIXELS = 30  # of a level, whose variance says whether a straight line holds
 CLEAR_SIGMA = 4.0  # by which the variance must rise with the level for the slope to be certain (3e-5 by chance)
@@ -91,11 +92,12 @@ def noise_from_image(
     windows = Windows.of(frame, targets, guess, kind, aperture_px, True, False)
     start = None
     for step in range(PASSES):
-        left = _leftovers(windows, targets, which, guess, kind, threads, start, rows=False)
-        before, guess, start = guess, _fitted(left, guess, least), left.parameters
-        if step and _alike(before, guess, left.level):
-            break
-    return _with_row_shifts(guess, windows, targets, which, kind, threads, start)
+        fits = _fits(windows, targets, which, guess, kind, threads, start)
+        left = _leftovers(windows, fits, guess, threads, rows=False)
+        before, guess, start = guess, _fitted(left, guess, least), fits.start
+        if _alike(before, guess, left.level, SETTLED if step else AT_ONCE):
+            return _with_row_shifts(guess, windows, targets, which, kind, threads, fits)
+    return _with_row_shifts(guess, windows, targets, which, kind, threads, _fits(windows, targets, which, guess, kind, threads, start))
 
 
 def row_shifts_from_image(
@@ -104,7 +106,7 @@ def row_shifts_from_image(
     """Return a noise model that is known with the shifts of rows against each other that the frame shows; arguments as above."""
     which = _some(targets)
     windows = Windows.of(frame, targets, noise, kind, aperture_px, True, False)
-    return _with_row_shifts(noise, replace(windows, noise=noise), targets, which, kind, threads, None)
+    return _with_row_shifts(noise, windows, targets, which, kind, threads, _fits(windows, targets, which, noise, kind, threads, None))
 
 
 def _some(targets: Targets) -> np.ndarray:
@@ -119,16 +121,17 @@ def _with_row_shifts(
     which: np.ndarray,
     kind: str,
     threads: int | None,
-    start: np.ndarray | None,
+    fits: _Fits,
 ) -> NoiseModel:
     """The noise with what rows are shifted against each other; where columns are so as well, it is the shape that does not fit."""
-    rows = row_shifts(_leftovers(windows, targets, which, noise, kind, threads, start, rows=True))
+    rows = row_shifts(_leftovers(windows, fits, noise, threads, rows=True))
     if not any(rows):
         return noise
     turned = transposed(targets)
     frame = np.ascontiguousarray(windows.frame.T)
     aside = Windows.of(frame, turned, noise, kind, windows.aperture_px, True, False)
-    columns = row_shifts(_leftovers(aside, turned, which, noise, kind, threads, None, rows=True))
+    fits = _fits(aside, turned, which, noise, kind, threads, None)
+    columns = row_shifts(_leftovers(aside, fits, noise, threads, rows=True))
     if math.hypot(*columns) > ROWS_ALONE * math.hypot(*rows):
         return noise
     return replace(noise, row_shift_px=rows[0], field_shift_px=rows[1])
@@ -151,13 +154,13 @@ def transposed(targets: Targets) -> Targets:
     )
 
 
-def _alike(one: NoiseModel, other: NoiseModel, level: np.ndarray) -> bool:
-    """Whether two models say nearly the same at the ends of the levels that there are."""
+def _alike(one: NoiseModel, other: NoiseModel, level: np.ndarray, most: float) -> bool:
+    """Whether two models say nearly the same, up to a ratio, at the ends of the levels that there are."""
     if not len(level):
         return True
     ends = np.array([level.min(), level.max()])
     ratio = one.variance_dn2(ends) / other.variance_dn2(ends)
-    return bool((ratio < SETTLED).all() and (ratio > 1 / SETTLED).all())
+    return bool((ratio < most).all() and (ratio > 1 / most).all())
 
 
 @dataclass(frozen=True)
@@ -170,8 +173,6 @@ class Leftovers:
         Of pixels: fitted grey value, residual over √(1 − leverage), slope of the fitted image in DN per pixel.
     score, spread : ndarray, shape (n, rows) and (n, rows, rows)
         Of the rows of targets: the score Σ w µ_x (d − µ) of a shift along x, and its covariance under the noise.
-    parameters : ndarray
-        Of the fits; start values where there is none.
     """
 
     level: np.ndarray
@@ -179,38 +180,38 @@ class Leftovers:
     steep: np.ndarray
     score: np.ndarray
     spread: np.ndarray
-    parameters: np.ndarray
 
 
-def _leftovers(
-    windows: Windows,
-    targets: Targets,
-    which: np.ndarray,
-    noise: NoiseModel,
-    kind: str,
-    threads: int | None,
-    start: np.ndarray | None,
-    *,
-    rows: bool,
-) -> Leftovers:
-    """Fit some of the targets and look at what is left: of pixels, or of rows."""
+class _Fits(NamedTuple):
+    """First fits of some targets."""
+
+    fitted: Fitted
+    slopes: int  # of planes, that were among the unknowns
+    start: np.ndarray  # of the next fits: the parameters, or where there are none the start values that these had
+
+
+def _fits(
+    windows: Windows, targets: Targets, which: np.ndarray, noise: NoiseModel, kind: str, threads: int | None, start: np.ndarray | None
+) -> _Fits:
+    """Fit some of the targets."""
     windows = replace(windows, noise=noise)
-    first = windows.start if start is None else start
     # planes, so that light or a ground that slopes is not taken for noise; small targets cannot tell them from the rest
     ground = bool(np.median(targets.semi_minor_px[which]) > LEAST_SLOPED_PX)
     light = ground and kind != "spot"
-    fitted = run_fit(windows, which, first, ground, light, False, threads)
+    fitted = run_fit(windows, which, windows.start if start is None else start, ground, light, False, threads)
     fitted = with_second_start(windows, targets, which, fitted, (ground, light, False), threads)
-    slopes = 2 * ground + 2 * light
-    model = windows.model
+    return _Fits(fitted, 2 * ground + 2 * light, np.where(fitted.at_rest[:, None], fitted.parameters, windows.start))
+
+
+def _leftovers(windows: Windows, fits: _Fits, noise: NoiseModel, threads: int | None, *, rows: bool) -> Leftovers:
+    """Look at what fits leave: of pixels, or of rows."""
+    model, fitted = replace(windows, noise=noise).model, fits.fitted
 
     def piece(good: np.ndarray) -> tuple[np.ndarray, ...]:
-        return residuals(windows.frame, model, fitted.parameters, slopes, good, windows.about, rows)
+        return residuals(windows.frame, model, fitted.parameters, fits.slopes, good, windows.about, rows)
 
     pieces = map_tiles(piece, np.array_split(np.flatnonzero(fitted.at_rest), PIECES), threads)
-    level, residual, steep, score, spread = (np.concatenate(values) for values in zip(*pieces, strict=True))
-    parameters = np.where(fitted.at_rest[:, None], fitted.parameters, windows.start)
-    return Leftovers(level, residual, steep, score, spread, parameters)
+    return Leftovers(*(np.concatenate(values) for values in zip(*pieces, strict=True)))
 
 
 def _fitted(left: Leftovers, guess: NoiseModel, least: float) -> NoiseModel:

@@ -168,7 +168,7 @@ def run_fit(
         place = np.concatenate([[0], np.cumsum(side * ((side + 7) // 8 * 8))])
         packed = kernels.Packed(place, np.empty(place[-1], np.float32), np.empty(place[-1], np.float32))
         kernels.cut_out(w.frame, about, model.noise, part, packed, quality)
-        kernels.fit(model, start, free, test, about, part, packed, fits)
+        kernels.fit(model, start, start is w.start, free, test, about, part, packed, fits)
 
     map_tiles(piece, range(0, len(which), chunk), threads)
     dof = quality[:, 1] - free.sum()

@@ -171,7 +171,8 @@ class Tracker:
                 "no target in the first frame", where="Tracker", remedy="check kind and polarity, or begin with another frame"
             )
         shape = self._settings.shape
-        wider, _ = with_correlation(image, spots.regions, spots.targets, found, spots.noise, shape, 1.0)
+        fitted = self.estimator == "template"
+        wider = with_correlation(image, spots.regions, spots.targets, found, spots.noise, shape, 1.0, spots.coder, fitted=fitted)[0]
         self._start(image, spots.targets[good], shared_noise(found, wider)[good], search_px, 0.0 if time is None else time)
 
     def __len__(self) -> int:
