@@ -2,13 +2,16 @@
 
 Three simulated networks, noise 0.04 px, from start values 1 % wrong in the principal distance, 3 mm in points, 5 mm and 0.3° in images; one
 thread. Ours estimates ten interior parameters and gives their covariance, that of all images and a 3 × 3 covariance for each point. Beside
-it pycolmap (``pip install pixmetry[bench]``), model OPENCV with eight interior parameters: adjustment, and its covariance of poses, points
+it pycolmap (``pip install pixmetry[peers]``), model OPENCV with eight interior parameters: adjustment, and its covariance of poses, points
 and interior. Networks are made without what it lacks (shear, K3), so that both reach the same residuals. Reading the network into either is
 not counted. Both run one after the other in every repeat; a ratio is the median of those of the repeats, of wall and of processor time.
+
+``python benchmarks/bench_bundle.py large`` times one of 1000 images × 20 000 points once, ours alone, and prints the memory it took.
 """
 
 from __future__ import annotations
 
+import resource
 import sys
 import time
 from collections.abc import Callable
@@ -133,13 +136,30 @@ def compare(name: str, pycolmap: ModuleType | None, rng: np.random.Generator) ->
     verdict(f"{name}, processor time over pycolmap", float(np.median(ratios[:, 1])), goal)
 
 
+def large(rng: np.random.Generator) -> None:
+    """Time and memory of 1000 images × 20 000 points, each point in 32 images."""
+    simulated = simulate(
+        rng, images=1000, points=20_000, visibility=0.025, bars=0, direction="object_to_image", interior={"b2": 0.0, "k3": 0.0}
+    )
+    results: list[Adjustment] = []
+    wall, processor = timed(lambda: results.append(adjust(simulated.network, start_of(rng, simulated))))
+    found = results[-1]
+    memory_gb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+    print(f"{found.used.sum()} image points, {len(found.free_columns)} reduced unknowns, {found.iterations} iterations")
+    print(f"  {wall:.1f} s wall, {processor:.1f} s processor, {memory_gb:.2f} GB; sigma0 {found.sigma0:.4f}")
+
+
 def main() -> None:
     """Print times and ratios, network by network."""
+    if sys.argv[1:] == ["large"]:
+        with single_threaded_blas():
+            large(np.random.default_rng(np.random.SeedSequence()))
+        return
     try:
         import pycolmap
     except ImportError:
         pycolmap = None
-        print("pycolmap is not installed: no ratios (pip install pixmetry[bench])")
+        print("pycolmap is not installed: no ratios (pip install pixmetry[peers])")
     rng = np.random.default_rng(np.random.SeedSequence())
     with single_threaded_blas():
         for name in NETWORKS:

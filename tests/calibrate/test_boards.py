@@ -10,35 +10,45 @@ import pytest
 from click.testing import CliRunner
 
 from calibrate.test_calibration_images import View, differences
+from pixmetry import locate
 from pixmetry.calibrate.images.boards import PrintedBoard, board_of
 from pixmetry.calibrate.images.images import observations_of
 from pixmetry.cli import main
 from pixmetry.core.errors import InputError, MeasureError
 
 CELLS = {"charuco": 28, "aprilgrid": 130}  # samples a pitch in which all edges of a board lie between two samples
+ROUND = 140  # of boards of discs and rings
 
 
-def painted(board: PrintedBoard, pitch: float) -> np.ndarray:
-    """What is printed, 0 and 1, on samples of which the board's pitch is a whole number."""
+def painted(board: PrintedBoard, step: float) -> np.ndarray:
+    """What is printed, 0 and 1, on so many samples a unit of length."""
     x, y, width, height = board.box
-    step = CELLS[board.options.split()[1]] / pitch
     ink = np.ones((round(height * step), round(width * step)), np.float32)
     edges = np.rint((board.black - [x, y, 0, 0]) * step).astype(int)
     for left, top, wide, high in edges:
         ink[top : top + high, left : left + wide] = 0
+    rings = np.concatenate([np.column_stack([board.discs, board.discs[:, 2], np.tile([0, 360], (len(board.discs), 1))]), board.sectors])
+    for u, v, outer, wide, first, last in rings:
+        low = np.floor((np.array([u - x, v - y]) - outer) * step).astype(int)
+        j, i = np.mgrid[low[1] : low[1] + int(2 * outer * step) + 2, low[0] : low[0] + int(2 * outer * step) + 2]
+        du, dv = (i + 0.5) / step + x - u, (j + 0.5) / step + y - v
+        radius, angle = np.hypot(du, dv), np.degrees(np.arctan2(dv, du)) % 360
+        inside = (radius < outer) & (radius >= outer - wide) & (angle >= first) & (angle <= last)
+        ink[j[inside], i[inside]] = 0
     return ink
 
 
-def seen(board: PrintedBoard, view: View, rng: np.random.Generator, pitch: float) -> np.ndarray:
-    """The board in front of a grey wall."""
-    ink, step, (x0, y0) = painted(board, pitch), CELLS[board.options.split()[1]] / pitch, board.box[:2]
+def seen(board: PrintedBoard, view: View, rng: np.random.Generator, pitch: float, sub: int = 2) -> np.ndarray:
+    """The board in front of a grey wall; edges along the samples are off by half of their spacing at most."""
+    step, (x0, y0) = CELLS.get(board.options.split()[1], ROUND) / pitch, board.box[:2]
+    ink = painted(board, step)
 
     def paint(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         i, j = np.floor((x - x0) * step).astype(int), np.floor((y - y0) * step).astype(int)
         on = (i >= 0) & (i < ink.shape[1]) & (j >= 0) & (j < ink.shape[0])
         return np.where(on, ink[np.clip(j, 0, ink.shape[0] - 1), np.clip(i, 0, ink.shape[1] - 1)], 0.6)
 
-    return view.frame(paint, rng)
+    return view.frame(paint, rng, sub=sub)
 
 
 @pytest.mark.parametrize(
@@ -59,7 +69,7 @@ def test_a_printed_board_is_found_with_its_numbers(
         View(middle, distance, 190.0),
         View(cut, 0.8 * distance, 20.0, 10, 5),
     ]
-    frames = [seen(board, view, rng, 1.0) for view in views]
+    frames = [seen(board, view, rng, 1.0, sub=4) for view in views]
     found = observations_of(frames, kind, grid=grid, pitch=1.0, side=side)
     assert len(found.images) == 4 and not [f for f in found.findings if f.kind == "numbering"]
     for name, xyz in zip(found.points, found.xyz, strict=True):
@@ -72,11 +82,45 @@ def test_a_printed_board_is_found_with_its_numbers(
 def test_another_board_and_a_mirrored_one_are_refused(rng: np.random.Generator) -> None:
     board = board_of("charuco", (6, 5), 1.0, side_mm=20 / 28)
     frame = seen(board, View((2.0, 1.5), 8.0), rng, 1.0)
-    for wrong in (frame[:, ::-1].copy(), np.full_like(frame, 90)):
-        with pytest.raises(MeasureError, match=r"no chessboard of 6 × 5 squares with markers"):
+    for wrong, what in ((frame[:, ::-1].copy(), "the picture is mirrored"), (np.full_like(frame, 90), "was found")):
+        with pytest.raises(MeasureError, match=rf"no chessboard of 6 × 5 squares with markers .*{what}"):
             observations_of([wrong], "charuco", grid=(6, 5), pitch=1.0, side=20 / 28, least_images=1)
+    tags = board_of("aprilgrid", (4, 3), 1.0, side_mm=100 / 130)
+    mirrored = seen(tags, View((1.4, 0.9), 7.0), rng, 1.0)[:, ::-1].copy()
+    with pytest.raises(MeasureError, match="no grid of 4 × 3 tags .*the picture is mirrored"):
+        observations_of([mirrored], "aprilgrid", grid=(4, 3), pitch=1.0, side=100 / 130, least_images=1)
     with pytest.raises(MeasureError, match="no grid of 4 × 3 tags"):
         observations_of([frame], "aprilgrid", grid=(4, 3), pitch=1.0, side=0.7, least_images=1)
+
+
+@pytest.mark.parametrize(("rings", "grid"), [("RING_8", (5, 3)), ("RING_14", (5, 4)), ("RING_20", (4, 3))])
+def test_printed_rings_are_read_with_their_numbers(rings: str, grid: tuple[int, int], rng: np.random.Generator) -> None:
+    """Tilted and rolled: each target that is read has the number that the print's table gives for its place, and most are read (the
+    ellipse of a disc beside segments does not always converge); as rings of 12 segments they are
+    refused, with the name of those that are there."""
+    board = board_of("coded", grid, 1.0, dictionary=rings)
+    view = View(((grid[0] - 1) / 2, (grid[1] - 1) / 2), 1.8 * grid[0], float(rng.uniform(0, 360)), 20, -15)
+    frame = seen(board, view, rng, 1.0)
+    found = observations_of([frame], "coded", dictionary=rings, least_images=1)
+    assert set(found.points) <= set(board.points) and len(found.points) >= 0.5 * len(board.points)
+    expected = view.image(np.array([board.points[name] for name in found.points]))
+    seen_at = np.column_stack([found.x_px, found.y_px])[np.argsort(found.point)]
+    assert np.abs(seen_at - expected).max() < 0.3  # with the eccentricity of an ellipse; the next target is 40 px away
+    told = locate(frame, kind="coded").images[0]["rings"]
+    assert f"targets have codes of {rings}" in told and f"ask for dictionary {rings}" in told
+    with pytest.raises(MeasureError, match=f"targets have codes of {rings}"):
+        observations_of([frame], "coded", least_images=1)
+
+
+def test_a_printed_asymmetric_plate_is_found(rng: np.random.Generator) -> None:
+    """And it is OpenCV's: an odd number of rows tells its turn, so each point lies where its name says."""
+    board = board_of("asymmetric", (4, 7), 1.0)
+    view = View((1.75, 1.5), 7.5, 190.0, 15, 10)
+    found = observations_of([seen(board, view, rng, 1.0)], "asymmetric", grid=(4, 7), pitch=1.0, least_images=1)
+    assert set(found.points) == set(board.points)
+    for name, xyz in zip(found.points, found.xyz, strict=True):
+        assert board.points[name] == pytest.approx(tuple(xyz[:2]), abs=1e-9)
+    assert np.abs(differences(found, [view])).max() < 0.3
 
 
 def test_the_command_prints_and_calibrate_takes_pictures_of_it(tmp_path: Path, rng: np.random.Generator) -> None:
@@ -114,6 +158,10 @@ def test_the_command_prints_and_calibrate_takes_pictures_of_it(tmp_path: Path, r
         ("dots", {"side_mm": 3.0}, "no meaning"),
         ("charuco", {"side_mm": 30.0}, "do not fit"),
         ("charuco", {"dictionary": "4X4_7"}, "no such dictionary"),
+        ("coded", {"dictionary": "RING_9"}, "no such rings"),
+        ("coded", {"dictionary": "RING_8"}, "not so many codes"),
+        ("coded", {"diameter_mm": 6.0}, "do not fit"),
+        ("asymmetric", {"diameter_mm": 15.0}, "do not fit"),
         ("aprilgrid", {"dictionary": "APRILTAG_16h5"}, "too few markers"),
     ],
 )

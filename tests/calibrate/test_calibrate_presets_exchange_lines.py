@@ -181,6 +181,13 @@ def test_pictures_of_a_board_with_a_camera_file(tmp_path: Path, monkeypatch: pyt
     assert found.sensor.pitch_x_um == 5 and found["c"] == pytest.approx(FOCAL * 5e-3, rel=1e-3)
     assert made.facts["principal_distance_mm"] == pytest.approx(found["c"], rel=1e-6) and LENS in made
 
+    plate = ("--grid", "7x5", "--pitch-mm", 20, "--free", "none")  # with nothing to estimate but its pose one picture is enough
+    alone = run("board_1.npy", *plate, "--c-px", FOCAL, "--direction", "object_to_image", "-o", "one")
+    assert alone.exit_code == 0, alone.output
+    one, all_of = read_calibration(tmp_path / "one"), read_calibration(tmp_path / "r")
+    there, here = (np.linalg.norm(stored.position[stored.images.index("board_1.npy")]) for stored in (all_of, one))
+    assert here == pytest.approx(there, rel=2e-3)
+
 
 # --- OpenCV and COLMAP --------------------------------------------------------------------------------------------------------------
 

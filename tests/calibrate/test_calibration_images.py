@@ -41,14 +41,14 @@ class View:
         h = np.column_stack([xy, np.ones(len(xy))]) @ self.homography.T
         return h[:, :2] / h[:, 2:]
 
-    def frame(self, paint: Paint, rng: np.random.Generator, noise_dn: float = 1.5, blur_px: float = 0.7) -> np.ndarray:
-        """Mean of SUB² samples a pixel, blurred, with noise, shape (ROWS, COLS), uint8."""
-        at = (np.arange(SUB) + 0.5) / SUB - 0.5
+    def frame(self, paint: Paint, rng: np.random.Generator, noise_dn: float = 1.5, blur_px: float = 0.7, sub: int = SUB) -> np.ndarray:
+        """Mean of sub² samples a pixel, blurred, with noise, shape (ROWS, COLS), uint8."""
+        at = (np.arange(sub) + 0.5) / sub - 0.5
         x, y = np.meshgrid((np.arange(COLS)[:, None] + at).ravel(), (np.arange(ROWS)[:, None] + at).ravel())
         ray = np.linalg.inv(self.homography) @ np.stack([x.ravel(), y.ravel(), np.ones(x.size)])
-        light = paint(ray[0] / ray[2], ray[1] / ray[2]).reshape(ROWS * SUB, COLS * SUB)
-        fine = gaussian_filter(light, blur_px * SUB, mode="nearest")
-        grey = 40 + 160 * fine.reshape(ROWS, SUB, COLS, SUB).mean(axis=(1, 3))
+        light = paint(ray[0] / ray[2], ray[1] / ray[2]).reshape(ROWS * sub, COLS * sub)
+        fine = gaussian_filter(light, blur_px * sub, mode="nearest")
+        grey = 40 + 160 * fine.reshape(ROWS, sub, COLS, sub).mean(axis=(1, 3))
         return np.clip(np.rint(grey + rng.normal(0, noise_dn, grey.shape)), 0, 255).astype(np.uint8)
 
 

@@ -61,6 +61,12 @@ def told(rng, simulated: Simulated, exact: np.ndarray, **options) -> FieldSource
 
 def ratios(found: HeightMap, params: surface.Unflatness) -> np.ndarray:
     """Errors over u of the combinations that are told, which are independent."""
+    values, true = over_u(found, params)
+    return values - true
+
+
+def over_u(found: HeightMap, params: surface.Unflatness) -> tuple[np.ndarray, np.ndarray]:
+    """These combinations as they were found, and the true ones, over u."""
     degrees = list(zip(found.across, found.down, strict=True))
     truth = np.zeros(len(degrees))
     for degree, name in TERMS.items():
@@ -68,7 +74,8 @@ def ratios(found: HeightMap, params: surface.Unflatness) -> np.ndarray:
     power, directions = np.linalg.eigh(found.covariance_px2)
     kept = power > 1e-9 * power.max()
     assert kept.sum() == found.rank
-    return directions[:, kept].T @ (found.coefficients_px - found.told @ truth) / np.sqrt(power[kept])
+    values, true = (directions[:, kept].T @ part / np.sqrt(power[kept]) for part in (found.coefficients_px, found.told @ truth))
+    return values, true
 
 
 def others(rng, simulated: Simulated, seen: np.ndarray, which: str) -> np.ndarray:
@@ -90,8 +97,9 @@ def others(rng, simulated: Simulated, seen: np.ndarray, which: str) -> np.ndarra
 
 def test_stat_heights_of_random_cameras_lie_where_their_u_says(rng):
     """24 cameras, most with one more error of another kind: squares of the ratios against chi square with u from 20 % too small to as
-    much too large, and every surface found."""
-    z = []
+    much too large. Surfaces of 12 u are seen: chance takes 6 of these, beyond which p is 1e-6, in less than one of a million; one in
+    twelve is flatter. They are named, but for one in 200 which something else may have made."""
+    z, named = [], []
     for k in range(24):
         simulated = a_network(rng)
         params = a_surface(rng, simulated)
@@ -99,8 +107,11 @@ def test_stat_heights_of_random_cameras_lie_where_their_u_says(rng):
         which = ("none", "cells", "images", "clock", "fields", "none")[k % 6]
         found = told(rng, simulated, others(rng, simulated, seen, which)).height
         assert found.rank >= 4  # cells of 0.02 px and steps may hide a surface
-        assert which in ("cells", "fields") or found.found and found.p < 1e-6
+        if which not in ("cells", "fields") and np.linalg.norm(over_u(found, params)[1]) > 12:
+            named.append(found.found)
+            assert found.p < 1e-6
         z.append(ratios(found, params))
+    assert len(named) >= 7 and np.count_nonzero(named) >= len(named) - 4  # of 16
     z = np.concatenate(z)
     assert abs(z.mean()) < 1.2 * stats.norm.isf(RATE / 2) / np.sqrt(len(z))
     assert stats.chi2.ppf(RATE, len(z)) * 0.8**2 < (z**2).sum() < stats.chi2.isf(RATE, len(z)) * 1.2**2

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import sys
+import zlib
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,7 +14,7 @@ import pytest
 
 from calibrate.networks import simulate
 from pixmetry.calibrate.bundle.solve import Options, calibrate_network
-from pixmetry.calibrate.files.record import _record, _stored
+from pixmetry.calibrate.files.record import _record, _stored, calibration_json
 from pixmetry.calibrate.records import (
     AxisComponent,
     CameraComponents,
@@ -97,3 +100,65 @@ def test_covariances_of_points_are_stored_as_lower_triangles_and_those_of_older_
     del record["points"]["covariance_form"]
     record["points"]["covariance"] = expected[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]].tolist()
     np.testing.assert_allclose(_stored(record).point_covariance, expected, rtol=1e-9)
+
+
+SCHEMA = json.loads((Path(__file__).parents[2] / "docs" / "calibration-result.schema.json").read_text(encoding="utf-8"))
+KEYWORDS = {"$schema", "$id", "$defs", "$ref", "title", "description", "type", "const", "enum", "properties", "required",
+            "additionalProperties", "items", "minItems", "maxItems", "minimum"}  # fmt: skip
+TYPES = {"object": dict, "array": list, "string": str, "number": (int, float), "integer": int, "boolean": bool, "null": type(None)}
+
+
+def faults_of(value: object, schema: dict, at: str = "") -> list[str]:
+    """Where a value breaks a JSON schema of the keywords above (draft 2020-12), written from its specification."""
+    assert set(schema) <= KEYWORDS, set(schema) - KEYWORDS
+    if "$ref" in schema:
+        return faults_of(value, SCHEMA["$defs"][schema["$ref"].rpartition("/")[2]], at)
+    kinds = schema.get("type", list(TYPES))
+    kinds = [kinds] if isinstance(kinds, str) else kinds
+    if not any(isinstance(value, TYPES[k]) and (k == "boolean" or not isinstance(value, bool)) for k in kinds):
+        return [f"{at}: {type(value).__name__} for {kinds}"]
+    out = [f"{at}: {value!r}"] if value != schema.get("const", value) or value not in schema.get("enum", [value]) else []
+    if isinstance(value, dict):
+        own = schema.get("properties", {})
+        out += [f"{at}/{name} is missing" for name in schema.get("required", []) if name not in value]
+        out += [f"{at}/{name} is not known" for name in value if name not in own and not schema.get("additionalProperties", True)]
+        out += [fault for name in own if name in value for fault in faults_of(value[name], own[name], f"{at}/{name}")]
+    if isinstance(value, list):
+        ok = schema.get("minItems", 0) <= len(value) <= schema.get("maxItems", len(value))
+        out += [] if ok else [f"{at}: {len(value)} items"]
+        out += [fault for k, item in enumerate(value) for fault in faults_of(item, schema.get("items", {}), f"{at}/{k}")]
+    if isinstance(value, int | float) and "minimum" in schema and value < schema["minimum"]:
+        out.append(f"{at}: {value} is too small")
+    return out
+
+
+def test_the_documented_schema_holds(calibration):
+    """Of a camera in mm and of a rig; and what is broken in a record is found by it."""
+    from calibrate.rigs import simulated_rig
+
+    record = json.loads(calibration_json(calibration))
+    assert faults_of(record, SCHEMA) == []
+    rig = simulated_rig(np.random.default_rng(2), instants=5)
+    assert faults_of(json.loads(calibration_json(calibrate_network(rig.network, Options(folds=0, snoop=False), rig.truth))), SCHEMA) == []
+    for path, wrong in (
+        (("sigma0",), "1"), (("cameras", 0, "direction"), "inwards"), (("cameras", 0, "parameters", 0, "free"), 1),
+        (("images", "rotation", 0), [1.0] * 8), (("points", "xyz", 0, 2), "z"), (("dof",), -1), (("new",), 0), (("cameras",), []),
+    ):  # fmt: skip
+        broken = json.loads(calibration_json(calibration))
+        place = broken
+        for key in path[:-1]:
+            place = place[key]
+        place[path[-1]] = wrong
+        assert len(faults_of(broken, SCHEMA)) == 1, path
+    del record["unit"]
+    assert faults_of(record, SCHEMA) == ["/unit is missing"]
+
+
+def test_the_covariance_is_read_as_the_documentation_says(calibration):
+    """In four lines, without pixmetry."""
+    told = json.loads(calibration_json(calibration))["covariance"]
+    lower = np.frombuffer(zlib.decompress(base64.b64decode(told["data"])), "<f8")
+    matrix = np.zeros((told["size"], told["size"]))
+    matrix[np.tril_indices(told["size"])] = lower
+    np.testing.assert_allclose(matrix + np.tril(matrix, -1).T, calibration.adjustment.covariance, rtol=1e-9, atol=1e-25)
+    assert len(told["columns"]) == told["size"]

@@ -438,7 +438,8 @@ def test_the_uncertainty_of_the_scale_is_that_of_the_bar_whatever_is_stated_of_t
 
 
 def test_one_bad_image_is_named_and_no_drift_is_made_of_it(rng):
-    """One image with five times the noise of the others and a bend of its own."""
+    """One image with five times the noise of the others and a bend of its own. Noise alone makes a drift significant in a few of a
+    thousand networks: none may be surer than one in a million."""
     simulated = simulate(rng, images=13, points=54, field="plane", known="fixed", bars=0)
     network = simulated.network
     bad = network.image == 7
@@ -448,7 +449,8 @@ def test_one_bad_image_is_named_and_no_drift_is_made_of_it(rng):
     first = calibration.findings[0]
     # by the pattern in its residuals, or where most of its points are too bad for that, by these
     assert first.kind in ("bad_images", "images_rejected") and network.images[7] in first.text and "leave it out" in first.advice
-    assert not {"x_scale_drift", "x_scale_by_image", "x_shift_by_image"} & set(kinds(calibration))
+    p = {one.name: one.p for one in calibration.tests.patterns}
+    assert min(p[name] for name in ("x_scale_trend", "x_scale_by_image", "x_shift_by_image")) > 1e-6 / 3
 
 
 @pytest.mark.filterwarnings("error")

@@ -13,11 +13,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from pixmetry.calibrate.bundle.model import NAMES, CameraModel, Direction, Projection, Sensor
+from pixmetry.calibrate.bundle.model import NAMES, POWERS, CameraModel, Direction, Projection, Sensor
 from pixmetry.core.arrays import Array
 from pixmetry.core.errors import InputError
 from pixmetry.core.extras import import_extra
@@ -61,7 +61,20 @@ class Converted:
     share: float = 1.0
 
 
-def converted(model: CameraModel, direction: Direction, names: tuple[str, ...] = NAMES, projection: Projection | None = None) -> Converted:
+class Known(NamedTuple):
+    """How well the parameters of a camera are known: names of the estimated ones, and their covariance."""
+
+    names: tuple[str, ...]
+    covariance: np.ndarray
+
+
+def converted(
+    model: CameraModel,
+    direction: Direction,
+    names: tuple[str, ...] = NAMES,
+    projection: Projection | None = None,
+    sensor: Sensor | None = None,
+) -> Converted:
     """The model in another direction or projection, or with fewer parameters: fitted all over the frame by least squares.
 
     Parameters
@@ -72,6 +85,8 @@ def converted(model: CameraModel, direction: Direction, names: tuple[str, ...] =
         Parameters the new form has; the others are 0.
     projection : str, optional
         By default that of the model.
+    sensor : Sensor, optional
+        Likewise; with another pitch.
 
     Returns
     -------
@@ -83,8 +98,8 @@ def converted(model: CameraModel, direction: Direction, names: tuple[str, ...] =
         If the model cannot be inverted in half of the frame, or is a fisheye that another projection cannot stand for.
     """
     kept = np.isin(NAMES, names)
-    projection = projection or model.projection
-    if (direction, projection) == (model.direction, model.projection) and not model.values[~kept].any():
+    projection, sensor = projection or model.projection, sensor or model.sensor
+    if (direction, projection, sensor) == (model.direction, model.projection, model.sensor) and not model.values[~kept].any():
         return Converted(model, 0.0)
     from scipy.optimize import least_squares
 
@@ -99,7 +114,7 @@ def converted(model: CameraModel, direction: Direction, names: tuple[str, ...] =
     if direction != model.direction:
         start[3:5] *= -1  # to first order
         start[0] *= 1 - start[3] * (direction == "image_to_object")
-    new = replace(model, direction=direction, projection=projection, values=start)
+    new = replace(model, direction=direction, projection=projection, sensor=sensor, values=start)
 
     def at(values: np.ndarray) -> CameraModel:
         row = start.copy()
@@ -115,13 +130,56 @@ def converted(model: CameraModel, direction: Direction, names: tuple[str, ...] =
         by = np.nan_to_num(at(values).projected(u, v)[3][:, :, kept])
         return np.concatenate([by[:, 0], by[:, 1]])
 
-    fit = least_squares(misses, start[kept], slopes, x_scale="jac", xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    starts = [start]
+    if projection == model.projection:  # strong corrections are not reached from none: from these, or their first terms turned round
+        turned = direction != model.direction
+        powers = np.array(POWERS) * (1 if direction == "image_to_object" else -1)
+        lens = -model.values * model["c"] ** powers.astype(float) if turned else model.values
+        starts.append(np.where(kept & np.isin(NAMES, ("k1", "p1", "p2") if turned else NAMES[5:]), lens, start))
+    fits = [least_squares(misses, one[kept], slopes, x_scale="jac", xtol=1e-15, ftol=1e-15, gtol=1e-15) for one in starts]
+    fit = min(fits, key=lambda one: one.cost)
     miss = misses(fit.x).reshape(2, -1)
     largest = float(np.hypot(*miss).max())
     if projection != model.projection and largest > PROJECTED_PX:  # a few terms of one projection do not stand for another
         what = f"a fisheye ({model.projection})" if projection == "perspective" else f"a {model.projection} lens"
         raise InputError(f"{what}, for which this form has no place", where=model.name, allowed=projection)
     return Converted(at(fit.x), largest, float(there.mean()))
+
+
+def carried_covariance(model: CameraModel, form: CameraModel, known: Known, names: tuple[str, ...] = NAMES) -> Known:
+    """Covariance of the parameters that a form of the model has, from that of the model's.
+
+    A change of the model's parameters moves the image points of all directions; that of the form's which moves them alike, by least squares
+    over the frame, is its derivative, as far as little is lost.
+
+    Parameters
+    ----------
+    model, form : CameraModel
+        As `converted` gives the second.
+    known : Known
+        Of the model.
+    names : tuple of str
+        Parameters of the form that may change.
+
+    Returns
+    -------
+    Known
+        Of those that the form has.
+    """
+    same = (model.direction, model.projection, model.sensor) == (form.direction, form.projection, form.sensor)
+    if same and set(known.names) <= set(names):
+        return known
+    grid = np.linspace(0, model.sensor.cols - 1, GRID), np.linspace(0, model.sensor.rows - 1, GRID)
+    u, v = model.direction_of(*(place.ravel() for place in np.meshgrid(*grid)))
+    there = np.isfinite(u + v)
+    own = [NAMES.index(name) for name in known.names]
+    old = np.moveaxis(model.projected(u[there], v[there])[3], 2, 0)[own].reshape(len(own), -1)
+    kept = [k for k, name in enumerate(NAMES) if name in names and (form.values[k] or name in known.names)]
+    new = np.moveaxis(form.projected(u[there], v[there])[3], 2, 0)[kept].reshape(len(kept), -1)
+    sound = np.isfinite(old).all(axis=0) & np.isfinite(new).all(axis=0)
+    size = np.linalg.norm(new[:, sound], axis=1)
+    by = np.linalg.lstsq((new[:, sound] / size[:, None]).T, old[:, sound].T, rcond=None)[0] / size[:, None]
+    return Known(tuple(NAMES[k] for k in kept), by @ known.covariance @ by.T)
 
 
 def opencv_form(model: CameraModel, tolerance_px: float = 0.0) -> dict[str, Any]:
@@ -163,7 +221,35 @@ def _uses(model: CameraModel, letter: str) -> bool:
     return any(value for name, value in zip(NAMES, model.values, strict=True) if name[0] == letter)
 
 
-def opencv_text(model: CameraModel, ending: str, tolerance_px: float = 0.0) -> str:
+def opencv_covariance(model: CameraModel, form: dict[str, Any], known: Known) -> np.ndarray:
+    """Covariance of the numbers that OpenCV has: fx, fy, cx, cy and the coefficients, in this order.
+
+    Parameters
+    ----------
+    model : CameraModel
+    form : dict
+        `opencv_form` of it.
+    known : Known
+        How well the model's parameters are known.
+    """
+    d = form["distortion_coefficients"]
+    lens = FISHEYE[4:] if form["fisheye"] else ORDER[: len(d)]
+    names = ("c", "xp", "yp", "b1", *lens)
+    projection: Projection = "equidistant" if form["fisheye"] else "perspective"
+    own = converted(model, "object_to_image", names, projection).model
+    of, covariance = carried_covariance(model, own, known, names)
+    (mx, my), c, b1 = own.sensor.per_px, own["c"], own["b1"]
+    slopes = {"c": (0, (1 + b1) / mx), "b1": (0, c / mx), "xp": (2, 1.0), "yp": (3, 1.0)} | {n: (4 + k, 1.0) for k, n in enumerate(lens)}
+    by = np.zeros((4 + len(d), len(of)))
+    for column, name in enumerate(of):
+        row, slope = slopes[name]
+        by[row, column] = slope
+        if name == "c":
+            by[1, column] = 1 / my
+    return by @ covariance @ by.T
+
+
+def opencv_text(model: CameraModel, ending: str, tolerance_px: float = 0.0, known: Known | None = None) -> str:
     """Camera of a file in OpenCV's FileStorage format.
 
     Parameters
@@ -171,6 +257,8 @@ def opencv_text(model: CameraModel, ending: str, tolerance_px: float = 0.0) -> s
     model : CameraModel
     ending : {".yaml", ".yml", ".xml", ".json"}
     tolerance_px : float
+    known : Known, optional
+        How well it is known: ``std_dev_intrinsics`` (as of ``cv2.calibrateCameraExtended``) and ``covariance_intrinsics``.
 
     Raises
     ------
@@ -192,6 +280,10 @@ def opencv_text(model: CameraModel, ending: str, tolerance_px: float = 0.0) -> s
     storage.write("distortion_coefficients", form["distortion_coefficients"].reshape(1, -1))
     if form["fisheye"]:
         storage.write("fisheye_model", 1)
+    if known is not None and known.names:
+        covariance = opencv_covariance(model, form, known)
+        storage.write("std_dev_intrinsics", np.sqrt(np.diag(covariance)).reshape(-1, 1))
+        storage.write("covariance_intrinsics", covariance)
     return str(storage.releaseAndGetString())
 
 
@@ -344,27 +436,38 @@ def vision_values(model: CameraModel) -> tuple[float, float, float, float, float
     return c * (1 + model["b1"]) / mx, c * model["b2"] / mx, c / my, model["xp"], model["yp"]
 
 
-def held(model: CameraModel, names: tuple[str, ...], tolerance_px: float, who: str, projection: Projection = "perspective") -> CameraModel:
-    """The model in a form that goes from object to image and has these parameters, if no more is lost than is allowed.
+def held(
+    model: CameraModel,
+    names: tuple[str, ...],
+    tolerance_px: float,
+    who: str,
+    projection: Projection = "perspective",
+    direction: Direction = "object_to_image",
+    sensor: Sensor | None = None,
+) -> CameraModel:
+    """The model in a form of this direction that has these parameters, if no more is lost than is allowed.
 
     Raises
     ------
     InputError
         Otherwise; it says what ``who`` has no place for.
     """
-    form = converted(model, "object_to_image", names, projection)
+    form = converted(model, direction, names, projection, sensor)
     if form.largest_px <= max(tolerance_px, EXACT_PX):
         return form.model
-    lost = [n for n in NAMES if n not in names and model[n]]
-    about = [f"{who} has no place for {', '.join(lost)}"] if lost else []
+    pitched = sensor is not None and sensor != model.sensor
+    lost = [n for n in NAMES if n not in names and model[n] and not (pitched and n == "b1")]
+    about = [f"{who} has a width of the pixels in place of b1"] if pitched else []
+    about += [f"{who} has no place for {', '.join(lost)}"] if lost else []
     if projection != model.projection:
         about.append(f"{who} is {projection}, this lens is {model.projection}")
-    if model.direction == "image_to_object":
-        about.append(f"{who} distorts from object to image, this model corrects from image to object")
+    if model.direction != direction:
+        ways = {"object_to_image": "distorts from object to image", "image_to_object": "corrects from image to object"}
+        about.append(f"{who} {ways[direction]}, this model {ways[model.direction]}")
     enough = np.ceil(100 * form.largest_px / (step := 10.0 ** np.floor(np.log10(form.largest_px)))) / 100 * step  # three digits, upwards
     kept = ",".join(n for n in names if n in ("c", "xp", "yp") or model[n])
     remedy = (
         f"allow it with tolerance_px={enough:.3g} (on the command line --may-lose-px {enough:.3g}), or calibrate with direction "
-        f"object_to_image and free {kept}"
+        f"{direction} and free {kept}"
     )
     raise InputError(f"{'; '.join(about)}: up to {form.largest_px:.2g} px would be lost", where=model.name, remedy=remedy)

@@ -124,7 +124,7 @@ def calibrate(
         _refuse_pictures(pictures, "a network")
         network, given = source, {}
     else:
-        project = _project(source, pictures, told)
+        project = _project(source, pictures, told, free)
         network, given = project.network, project.options
         if output is not None:
             check_folder(output, of, project.inputs)
@@ -286,7 +286,9 @@ def _steps(told: Progress) -> Callable[[str], None]:
     return step
 
 
-def _project(source: str | Path | Sequence[str | Path], pictures: Mapping[str, Any], progress: Progress) -> Project:
+def _project(
+    source: str | Path | Sequence[str | Path], pictures: Mapping[str, Any], progress: Progress, free: Sequence[str] | str | None
+) -> Project:
     from pixmetry.calibrate.project import load_project, project_of_pictures
 
     sources = [Path(source)] if isinstance(source, str | Path) else [Path(part) for part in source]
@@ -302,6 +304,8 @@ def _project(source: str | Path | Sequence[str | Path], pictures: Mapping[str, A
         raise InputError(f"unknown option '{unknown}'", allowed=", ".join(keys), remedy="delete it")
     given = {name: value for name, value in pictures.items() if value is not None}
     camera = {key: given[name] for name, key in CAMERA_KEYS.items() if name in given}
+    if free is not None and not _listed(free) and ("c_mm" in camera or "c_px" in camera):
+        camera["free"] = []  # where nothing is to be estimated, a single picture suffices
     plate = {key: given[name] for name, key in PICTURE_KEYS.items() if name in given}
     return project_of_pictures(sources, camera, plate, progress, rig=bool(given.get("rig")))
 

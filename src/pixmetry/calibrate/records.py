@@ -295,7 +295,7 @@ class SharedByCamera:
     ----------
     kinds : tuple of str
         Out of ``"image"`` (in one image), ``"frame"`` (at one place of the frame, in all images), ``"view"`` (in images from similar
-        directions).
+        directions), ``"oblique"`` (of targets seen obliquely).
     rms_px, p : ndarray, shape (kinds,)
         Of a coordinate; of an F-test against independent errors.
     independent_px : float

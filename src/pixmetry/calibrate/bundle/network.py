@@ -189,7 +189,7 @@ class SharedErrors:
     Parameters
     ----------
     kinds : tuple of (str, int)
-        ``"image"``, ``"frame"`` or ``"view"``, and the number of the camera; -1: of several cameras together.
+        ``"image"``, ``"frame"``, ``"view"`` or ``"oblique"``, and the number of the camera; -1: of several cameras together.
     rms_px : ndarray, shape (kinds,)
         Of a coordinate over the image points.
     p : ndarray, shape (kinds,)

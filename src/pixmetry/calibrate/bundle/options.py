@@ -52,6 +52,8 @@ class Options:
     shared_errors : bool
         Look for errors that image points have in common, and let the uncertainties hold them where they are significant. Without it, all
         errors are taken as independent.
+    patterns : bool
+        Search what the residuals hold for patterns, and what these tell of error sources.
     max_iterations : int
         Of one adjustment.
 
@@ -74,6 +76,7 @@ class Options:
     residual_grid: bool = False
     a_priori: bool = False
     shared_errors: bool = True
+    patterns: bool = True
     max_iterations: int = 100
 
     def __post_init__(self) -> None:

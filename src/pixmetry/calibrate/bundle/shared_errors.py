@@ -8,12 +8,18 @@ move with the view). They are random effects here: displacements F a with indepe
 
 - *image*: polynomials of degree 2 of the place in the frame, with new coefficients in each image;
 - *frame*: a stationary process over the frame with the covariance exp(−d²/2ℓ²), the same in all images of a camera;
-- *view*: the same polynomials times those of degree 1 and 2 of the target plane's tilt, the same in all images of a camera.
+- *view*: the same polynomials times those of degree 1 and 2 of the target plane's tilt, the same in all images of a camera;
+- *oblique*: a shift with the angle between ray and plane, as of the centres of circles, of one size for all targets.
+
+In a rig, which ties the images of its cameras together, the cameras share the variances of *image* and of *view*: residuals hardly tell
+whose they are.
 
 With whitened residuals v = R e, R = I − J N⁻¹ Jᵀ, the quadratic forms |Fₖᵀ v|² have the expectations Σ θⱼ tr(R Vₖ R Vⱼ): equations for
 the θ (MINQUE with equal weights), solved with θ ≥ 0. The estimates stay those of least squares; an error F a moves them by A a,
 A = N⁻¹ Jᵀ F, and their covariance is θ₀ N⁻¹ + Σ θₖ Aₖ Aₖᵀ. Its degrees of freedom are those of Satterthwaite. Where no part is significant
-(F-tests of the quadratic forms, with Bonferroni's factor), nothing is changed.
+(F-tests of the quadratic forms, with Bonferroni's factor), nothing is changed. The oblique shift has one coefficient, and moves the
+principal distance by far more than it leaves in the residuals: it is taken in from a lower level on, and like an error that is known and
+not corrected (GUM F.2.4.5) it costs no degrees of freedom.
 
 References
 ----------
@@ -34,7 +40,8 @@ from pixmetry.calibrate.bundle._bundle_kernels import ELIMINATED
 from pixmetry.calibrate.bundle.bundle_layout import Layout, layout_of
 from pixmetry.calibrate.bundle.bundle_system import Linearised, Loss, Solved, constraints_of, linearise, solve
 from pixmetry.calibrate.bundle.datum import Datum, carried, datum_of, null_space
-from pixmetry.calibrate.bundle.network import Adjustment, SharedErrors
+from pixmetry.calibrate.bundle.network import Adjustment, SharedErrors, State
+from pixmetry.calibrate.start.resection import thickness
 from pixmetry.core.arrays import Array, Flags, Ints
 from pixmetry.core.threads import single_threaded_blas
 
@@ -43,6 +50,8 @@ BUMPS = 1.2  # distance of the bumps that the process is made of, in their stand
 BEYOND = 1.5  # standard deviations by which bumps go over the frame
 TOLD = 1e-4  # share of the largest eigenvalue below which a part of the process is left out
 LEVEL = 0.01  # of the F-tests together
+LEVEL_OBLIQUE = 0.1  # of that of the shift of oblique targets
+PLANE = 0.2  # thickness over extent of an object whose targets are taken to lie in one plane
 LEAST_IMAGES = 4  # of a camera whose images have anything in common that can be told from what is each image's own
 LEAST_DOF = 20  # below, residuals tell nothing of this kind
 LEAST_TILT = 0.02  # rms sine of the tilt below which images have one direction of view
@@ -63,6 +72,7 @@ class View(NamedTuple):
 
     tilt: Array  # (images, 2): sines of the tilt of the object's plane about the axes of the camera
     scale: Array  # (cameras,): rms of them
+    normal: Array | None  # (points, 3) or (3,) of the targets; None: not known
 
 
 @dataclass(frozen=True)
@@ -157,22 +167,23 @@ def view_of(adjustment: Adjustment) -> View:
     """Directions from which a network's images see its object: the sines of the tilt of the plane that its points lie nearest to."""
     network, state = adjustment.network, adjustment.state
     points = state.xyz[state.located]
-    normal = np.linalg.svd(points - points.mean(axis=0))[2][2] if len(points) else np.array([0.0, 0.0, 1.0])
+    normal = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2][-1] if len(points) else np.array([0.0, 0.0, 1.0])
     along = state.rotation @ normal
     tilt = np.where(state.posed[:, None], (along * np.where(along[:, 2:] < 0, -1.0, 1.0))[:, :2], 0.0)
     scale = np.zeros(len(network.cameras))
     for k in range(len(scale)):
         mine = state.posed & (network.camera_of == k)
         scale[k] = np.sqrt(np.mean(tilt[mine] ** 2)) if mine.any() else 0.0
-    return View(tilt, scale)
+    return View(tilt, scale, network.normal if network.normal is not None else normal if thickness(points)[0] < PLANE else None)
 
 
-def effects_of(layout: Layout, took: Flags, view: View, own: Sequence[int] | None = None) -> list[Effect]:
+def effects_of(layout: Layout, state: State, took: Flags, view: View, own: Sequence[int] | None = None) -> list[Effect]:
     """The kinds of displacements that the image points of a network may share.
 
     Parameters
     ----------
     layout : Layout
+    state : State
     took : ndarray of bool, shape (n,)
         Image points that take part, in its order.
     view : View
@@ -186,10 +197,13 @@ def effects_of(layout: Layout, took: Flags, view: View, own: Sequence[int] | Non
     whole = own is None
     own = [k for k, of in enumerate(images) if len(of) >= LEAST_IMAGES] if own is None else own
     rest = [k for k in range(len(images)) if k not in own and len(images[k])]
-    found = [_by_image(layout, took & (camera == k), images[k], shapes, k) for k in own]
-    if rest:
-        of_rest = np.concatenate([images[k] for k in rest])
-        found.append(_by_image(layout, took & np.isin(camera, rest), of_rest, shapes, rest[0] if len(rest) == 1 else -1))
+    groups = [[*own, *rest]] if layout.rig is not None else [*([k] for k in own), rest]
+    found = []
+    for group in groups:
+        if group:
+            of_group = np.sort(np.concatenate([images[k] for k in group]))
+            found.append(_by_image(layout, took & np.isin(camera, group), of_group, shapes, group[0] if len(group) == 1 else -1))
+    views: list[Effect] = []
     for k in own:
         rows = np.flatnonzero(took & (camera == k))
         found.append(_effect(layout, "frame", k, rows, _process(layout, k, square[rows], principal=whole), np.zeros(len(rows), int), 1))
@@ -197,8 +211,42 @@ def effects_of(layout: Layout, took: Flags, view: View, own: Sequence[int] | Non
             a, b = (view.tilt[layout.image[rows]] / view.scale[k]).T
             tilts = np.stack([a, b, a**2, a * b, b**2], axis=1)
             both = (tilts[:, :, None] * shapes[rows][:, None, :]).reshape(len(rows), -1)
-            found.append(_effect(layout, "view", k, rows, both, np.zeros(len(rows), int), 1))
+            views.append(_effect(layout, "view", k, rows, both, np.zeros(len(rows), int), 1))
+    found += views if layout.rig is None or len(views) < 2 else [_together(views)]
+    straight = [k for k in own if layout.network.cameras[k].projection == "perspective"]  # the formula is of these
+    if straight and view.normal is not None and view.scale[straight].max() > LEAST_TILT:
+        rows = np.flatnonzero(took & np.isin(camera, straight))
+        found.append(_oblique(layout, state, rows, view.normal, straight[0] if len(straight) == 1 else -1))
     return found
+
+
+def _together(effects: Sequence[Effect]) -> Effect:
+    """Effects of one kind in several cameras, with one variance."""
+    sizes = [int(np.count_nonzero((effect.columns != 0).any(axis=1))) for effect in effects]
+    mean_square = float(np.average([effect.mean_square for effect in effects], weights=sizes))
+    return Effect(effects[0].kind, -1, np.hstack([effect.columns for effect in effects]), mean_square)
+
+
+def _oblique(layout: Layout, state: State, rows: Ints, normal: Array, camera: int) -> Effect:
+    """A shift across the ray, from or towards the normal, with the square of the image's size: c/Z² (n · d) (n_xy − n_z d_xy), with the
+    direction d = (X/Z, Y/Z, 1) and the normal n in the camera's frame.
+
+    It is the shift of the centre of a circle's image against the image of its centre, per square of its radius, in a camera that is turned
+    towards the circle: the circle X + r (e cos t + f sin t) on the axis has the image a/(1 + b), where a, b are r/Z (e cos t + f sin t)
+    along x or y and along z. The mean of −a b over t is n_z n_xy r²/(2 Z²), as e eᵀ + f fᵀ = 1 − n nᵀ; the centre of the ellipse is twice
+    as far. Other laws of the obliqueness (relief, light from one side) are much like it when the poses have taken what they can.
+    """
+    image, point = layout.image[rows], layout.point[rows]
+    rotation = state.rotation[image]
+    seen = np.einsum("nij,nj->ni", rotation, state.xyz[point] - state.position[image])
+    n = np.einsum("nij,nj->ni", rotation, np.broadcast_to(normal if normal.ndim == 1 else normal[point], seen.shape))
+    d = seen / seen[:, 2:]
+    at = layout.camera_of[image]
+    c_px = state.interior[at, :1] / layout.per_px[at]
+    shift = np.nan_to_num(c_px / seen[:, 2:] ** 2 * (n * d).sum(axis=1, keepdims=True) * (n[:, :2] - n[:, 2:] * d[:, :2]))
+    whole, w = np.zeros((2 * len(layout.x), 1)), layout.whiten[rows]
+    whole[2 * rows, 0], whole[2 * rows + 1, 0] = w[:, 0] * shift[:, 0], w[:, 1] * shift[:, 0] + w[:, 2] * shift[:, 1]
+    return Effect("oblique", camera, whole, float((shift**2).sum() / max(1, 2 * len(rows))))
 
 
 def _places(layout: Layout, camera: Ints) -> tuple[Array, Array, Array]:
@@ -316,18 +364,28 @@ def estimate_of(effects: Sequence[Effect], left: Array, forms: Array, squares: f
     unit = 1.0 if a_priori else squares / dof
     with np.errstate(divide="ignore", invalid="ignore"):
         p = stats.f.sf(y[1:] / (unit * T[0, 1:]), T[0, 1:] ** 2 / np.diag(T)[1:], dof)
-    theta = np.ones(k + 1)
-    if a_priori:
-        theta[1:] = nnls(T[1:, 1:] / size[1:, None], (y - T[:, 0])[1:] / size[1:])[0]
-    else:
-        theta = nnls(T / size[:, None], y / size)[0]
     p = np.nan_to_num(p, nan=1.0)
-    found = bool(p.min(initial=1.0) * k < LEVEL and theta[1:].any())
-    return Estimate(theta, _scatter(theta, T, left, parts, dof, a_priori) if found else np.zeros_like(T), p, found)
+    oblique = np.array([effect.kind == "oblique" for effect in effects], bool)
+    significant = p[~oblique].min(initial=1.0) * np.count_nonzero(~oblique) < LEVEL
+    taken = 1 + np.flatnonzero(np.where(oblique, p < LEVEL_OBLIQUE, significant))
+    theta = np.append(unit, np.zeros(k))
+    if not len(taken) and a_priori:  # nothing to solve: SciPy's nnls of no column frees memory twice
+        return Estimate(theta, np.zeros_like(T), p, False)
+    if a_priori:
+        theta[taken] = nnls(T[np.ix_(taken, taken)] / size[taken, None], (y - T[:, 0])[taken] / size[taken])[0]
+    else:
+        taken = np.append(0, taken)
+        theta[taken] = nnls(T[np.ix_(taken, taken)] / size[taken, None], y[taken] / size[taken])[0]
+    if not theta[1:].any():
+        return Estimate(theta, np.zeros_like(T), p, False)
+    found = (theta > 0) & np.append(False, oblique)
+    theta[found] += theta[0] / T[0, found]  # the square of the shift as it was found, noise and all
+    estimated = np.flatnonzero((theta > 0) & ~np.append(a_priori, oblique))
+    return Estimate(theta, _scatter(theta, T, left, parts, dof, estimated), p, True)
 
 
-def _scatter(theta: Array, T: Array, left: Array, parts: Sequence[slice], dof: int, a_priori: bool) -> Array:
-    """Covariance of the variances: T⁻¹ [2 tr(Vᵢ S Vⱼ S)] T⁻¹ of those above 0, S = Σ θ R V R, for normal errors."""
+def _scatter(theta: Array, T: Array, left: Array, parts: Sequence[slice], dof: int, active: Ints) -> Array:
+    """Covariance of the ``active`` variances: T⁻¹ [2 tr(Vᵢ S Vⱼ S)] T⁻¹, S = Σ θ R V R, for normal errors."""
     k = len(parts)
     weight = np.concatenate([np.full(part.stop - part.start, t) for part, t in zip(parts, theta[1:], strict=True)])
     weighted = left * weight
@@ -338,8 +396,6 @@ def _scatter(theta: Array, T: Array, left: Array, parts: Sequence[slice], dof: i
     for i, rows in enumerate(parts):
         E[0, i + 1] = E[i + 1, 0] = np.trace(twice[rows, rows])
         E[i + 1, 1:] = [(once[rows, columns] ** 2).sum() for columns in parts]
-    active = np.flatnonzero(theta > 0)
-    active = active[active > 0] if a_priori else active
     inverse = np.zeros_like(T)
     inverse[np.ix_(active, active)] = np.linalg.pinv(T[np.ix_(active, active)], hermitian=True)
     covariance: Array = 2 * inverse @ E @ inverse
@@ -366,13 +422,15 @@ def with_shared_errors(adjustment: Adjustment, *, a_priori: bool = False) -> Adj
     if system is None:
         return adjustment
     layout, now, took = system.layout, system.now, system.now.weight > 0
-    effects = effects_of(layout, took, view_of(adjustment))
+    effects = effects_of(layout, now.state, took, view_of(adjustment))
     m, residual = len(layout.columns), np.where(took[:, None], now.residual, 0.0).ravel()
     answers = [system.answers(effect.columns) for effect in effects]
     right, step = (np.concatenate([answer[k] for answer in answers], axis=1) for k in (0, 1))
     points = np.concatenate([answer[2] for answer in answers], axis=2)
     full = np.block([[_product(one.columns, other.columns) for other in effects] for one in effects])
-    left = full - right[:m].T @ step - right[m:].T @ points.reshape(-1, right.shape[1])
+    some = layout.eliminated
+    of_points = right[m:].reshape(points.shape)[some].reshape(-1, right.shape[1])
+    left = full - right[:m].T @ step - of_points.T @ points[some].reshape(of_points.shape)
     forms = np.concatenate([effect.columns.T @ residual for effect in effects])
     found = estimate_of(effects, left, forms, now.cost, adjustment.dof, a_priori=a_priori)
     kinds = tuple((effect.kind, effect.camera) for effect in effects)
@@ -448,9 +506,9 @@ def interior_parts(part: Adjustment, whole: Adjustment) -> tuple[Array, Array]:
     assert system is not None  # its covariance is there
     view, took = view_of(whole), system.now.weight > 0
     names = {name: i for i, name in enumerate(whole.network.images)}
-    view = View(view.tilt[[names[name] for name in part.network.images]], view.scale)
+    view = view._replace(tilt=view.tilt[[names[name] for name in part.network.images]])
     sizes = dict(zip(shared.kinds, shared.variance_px2, strict=True))
-    effects = effects_of(system.layout, took, view, [k for kind, k in shared.kinds if kind == "frame"])
+    effects = effects_of(system.layout, system.now.state, took, view, [k for kind, k in shared.kinds if kind == "frame"])
     own = own * shared.white_variance
     common = []
     for effect in [*effects, *(effect for _, effect in _other_images(system.layout, took, effects))]:
@@ -469,7 +527,7 @@ def shared_moves(adjustment: Adjustment, points: Ints) -> tuple[Array, Array]:
     system, shared = system_of(adjustment), adjustment.shared
     assert system is not None and shared is not None  # its covariance is there
     took = system.now.weight > 0
-    effects = effects_of(system.layout, took, view_of(adjustment))
+    effects = effects_of(system.layout, system.now.state, took, view_of(adjustment))
     found = []
     for i, effect in [*enumerate(effects), *_other_images(system.layout, took, effects)]:
         step, by_point = system.in_datum(*system.answers(effect.columns)[1:])

@@ -6,13 +6,14 @@ from dataclasses import asdict, replace
 
 import numpy as np
 
-from pixmetry.calibrate.bundle.model import NAMES
+from pixmetry.calibrate.bundle.model import NAMES, CameraModel
 from pixmetry.calibrate.bundle.network import PER_IMAGE_NAMES, Adjustment, Network, State
 from pixmetry.calibrate.bundle.options import Options
 from pixmetry.calibrate.bundle.rig import largest_turn, rig_of
 from pixmetry.calibrate.bundle.settling import Progress, Settled, adjust_with, settle
 from pixmetry.calibrate.checks.hold_out import LeftOut
 from pixmetry.calibrate.records import Calibration, EccentricityRecord, FieldTest, HoldOut, Tests
+from pixmetry.core.arrays import Array
 from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.finding import Finding
 from pixmetry.core.threads import single_threaded_blas
@@ -157,7 +158,10 @@ def _started(network: Network, start: State | None, options: Options, say: Progr
     if start is not None:
         return network, start
     say("finding start values")
+    given = network.cameras
     network, state = start_values(network)
+    if all(_has_lens(camera, row) for camera, row in zip(given, state.interior, strict=True)):
+        return network, in_their_frame(network, state)
     few = [replace(camera, free=camera.free & np.isin(NAMES, FEW)) for camera in network.cameras]
     loss = "huber" if options.loss == "none" and options.snoop else options.loss
     try:
@@ -166,6 +170,11 @@ def _started(network: Network, start: State | None, options: Options, say: Progr
     except MeasureError:
         pass  # the adjustment of all parameters says what is not determined
     return network, in_their_frame(network, state)
+
+
+def _has_lens(camera: CameraModel, found: Array) -> bool:
+    """Whether start values hold a lens that was estimated on the way to them."""
+    return bool((found != camera.values)[NAMES.index("k1") :].any())
 
 
 def _released(network: Network) -> Network:
@@ -253,7 +262,10 @@ def _tests(settled: Settled, stated: Adjustment, given: Network, options: Option
     from pixmetry.calibrate.checks.tests import tests_of
 
     alpha, shift = options.false_alarms / len(settled.measured), settled.shift
-    tests = tests_of(settled.adjustment, given, alpha, settled.known_faults, settled.rejected, stated=stated, a_priori=options.a_priori)
+    tests = tests_of(
+        settled.adjustment, given, alpha, settled.known_faults, settled.rejected, stated=stated,
+        a_priori=options.a_priori, patterns=options.patterns,
+    )  # fmt: skip
     if shift.corrected.any() or shift.possible_px:
         tests = replace(tests, eccentricity=EccentricityRecord(int(shift.corrected.sum()), shift.largest_px, shift.possible_px))
     return replace(tests, variance_components=settled.components or None)
@@ -264,7 +276,8 @@ def _without_claims(tests: Tests) -> Tests:
     from pixmetry.calibrate.checks.field_sources import without_claims
 
     sources = {name: without_claims(one, UNTESTED_FIELD) for name, one in (tests.field_sources or {}).items()}
-    return replace(tests, field_sources=sources or None, patterns=tuple(replace(p, confirmed=False) for p in tests.patterns or ()))
+    patterns = None if tests.patterns is None else tuple(replace(p, confirmed=False) for p in tests.patterns)
+    return replace(tests, field_sources=sources or None, patterns=patterns)
 
 
 def _findings(settled: Settled, tests: Tests) -> list[Finding]:

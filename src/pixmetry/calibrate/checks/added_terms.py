@@ -24,6 +24,7 @@ from pixmetry.core.arrays import Array
 
 RIDGE = 1e-11  # on a unit diagonal: carries the directions that no observation sees (the datum), moves no other
 OFTEN = 0.1  # share of the images that see a point above which dense products are faster
+SMALL = 400_000  # entries of the design up to which its product with the inverse root of the normal matrix is kept
 WEAKEST = 1e-6  # share of a term that must be left when the estimated parameters have taken theirs
 
 
@@ -179,6 +180,22 @@ class Beside:
     residual: np.ndarray
 
 
+@dataclass(frozen=True)
+class _Root:
+    """With a root L of the normal matrix, N = L Lᵀ.
+
+    Parameters
+    ----------
+    design : ndarray, shape (unknowns, 2 m)
+        L⁻¹ Aᵀ.
+    interior : ndarray, shape (interior parameters, unknowns)
+        Rows of L⁻ᵀ.
+    """
+
+    design: np.ndarray
+    interior: np.ndarray
+
+
 class AddedTerms:
     """The estimated parameters of an adjustment, ready to be held against terms that it did not estimate.
 
@@ -203,7 +220,11 @@ class AddedTerms:
         self._white = whitening(network.covariance_px2[self.rows]) * np.sqrt(adjustment.weight[self.rows])[:, None, None]
         self._residual = self._whitened(adjustment.residual_px[self.rows])
         self._cameras, self._points = self._designs(network, d)
-        self._factorise(network, state)
+        self._root: _Root | None = None
+        if np.prod(self._cameras.shape) + np.prod(self._points.shape) <= SMALL:
+            self._root = self._root_of(network, state)
+        else:
+            self._factorise(network, state)
 
     def test(self, terms: Any, combinations: np.ndarray | None = None) -> Terms:
         """Test terms, given by their derivatives.
@@ -242,7 +263,16 @@ class AddedTerms:
 
     def whitened(self, terms: Any) -> Any:
         """The same, whitened."""
-        return self._blocks @ self.as_rows(terms)
+        from scipy import sparse
+
+        rows = self.as_rows(terms)
+        if sparse.issparse(rows):
+            return self._blocks @ rows
+        white = self._white
+        pairs = rows.reshape(len(white), 2, -1)
+        if not (white[:, 1, 0].any() or white[:, 0, 1].any()):
+            return (np.einsum("nii->ni", white)[:, :, None] * pairs).reshape(rows.shape)
+        return (white @ pairs).reshape(rows.shape)
 
     def normals(self, terms: Any) -> Normals:
         """The normal equations of terms when the estimated parameters have taken what they can; terms as of `test`."""
@@ -252,12 +282,16 @@ class AddedTerms:
 
     def beside(self, terms: np.ndarray) -> Beside:
         """What the estimated parameters leave of terms, row by row, and by how much the terms change the cameras' parameters."""
+        from scipy import linalg
+
         white = self.whitened(terms)
+        if self._root is not None:
+            root, white = self._root, _dense(white)
+            along = root.design @ white
+            return Beside(white - root.design.T @ along, np.linalg.norm(white, axis=0), -root.interior @ along, self._residual)
         by_point = self._alone_design.T @ white
         over_points = self._point_inverse @ by_point
         right = _dense(self._kept.T @ white - self._cross.T @ over_points) * self._scale[:, None]
-        from scipy import linalg
-
         kept = linalg.cho_solve(self._factor, right) * self._scale[:, None]
         points = over_points - self._point_inverse @ (self._cross @ kept)
         rest = _dense(white) - self._kept @ kept - self._alone_design @ points
@@ -311,6 +345,29 @@ class AddedTerms:
         points = sparse.csr_matrix((by_point.ravel(), (lines.ravel(), columns.ravel())), shape=(2 * m, 3 * len(network.points)))
         return self._blocks @ by_camera, self._blocks @ points
 
+    def _root_of(self, network: Network, state: State) -> _Root:
+        """The whole system at once, of a small network."""
+        from scipy import linalg
+
+        first = self._cameras.shape[1]
+        design = np.hstack([self._cameras.toarray(), self._points.toarray()])
+        normal = design.T @ design
+        known = np.where((network.u_xyz > 0) & np.isfinite(network.u_xyz), network.u_xyz, np.inf).ravel()
+        normal[first:, first:] += np.diag(known**-2.0)
+        if len(network.bars):
+            normal[first:, first:] += _bar_rows(network, state, len(known)).toarray()
+        diagonal = np.diag(normal).copy()
+        for columns in self._summing_to_zero:
+            normal[np.ix_(columns, columns)] += diagonal[columns].mean()
+        seen = diagonal > 0  # not fixed points, nor images and points without observations
+        scale = 1 / np.sqrt(diagonal[seen])
+        normal = normal[np.ix_(seen, seen)] * np.outer(scale, scale)
+        normal[np.diag_indices(len(normal))] += RIDGE
+        inverse = linalg.solve_triangular(linalg.cholesky(normal, lower=True), np.diag(scale), lower=True)
+        interior = np.zeros((self._interior, len(normal)))
+        interior[seen[: self._interior]] = inverse[:, : int(seen[: self._interior].sum())].T
+        return _Root(inverse @ design[:, seen].T, interior)
+
     def _factorise(self, network: Network, state: State) -> None:
         """Eliminate the points without scale bars, and factorise the reduced system."""
         from scipy import linalg, sparse
@@ -347,6 +404,9 @@ class AddedTerms:
         """Gᵀ A (Aᵀ A)⁻ Aᵀ G."""
         from scipy import linalg
 
+        if self._root is not None:
+            along = self._root.design @ white
+            return np.asarray(along.T @ along)
         by_point = self._alone_design.T @ white
         over_points = self._point_inverse @ by_point
         right = _dense(self._kept.T @ white - self._cross.T @ over_points) * self._scale[:, None]

@@ -9,7 +9,7 @@ J. Am. Stat. Assoc. 90 (1995) 773–795).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -107,6 +107,7 @@ class _Explained:
     out_of: Mapping[str, int]
     squares: float
     dof: float
+    falls: dict[frozenset[str], tuple[float, int]] = field(default_factory=dict)
 
     def gain(self, name: str, beside: Sequence[str]) -> float:
         """2 ln of the evidence for a pattern beside others."""
@@ -132,8 +133,11 @@ class _Explained:
     def _fall(self, names: Sequence[str]) -> tuple[float, int]:
         if not names:
             return 0.0, 0
-        solved = self.normals.of(np.concatenate([self.parts[name] for name in names])).solved()
-        return solved.fall, solved.rank
+        which = frozenset(names)
+        if which not in self.falls:
+            solved = self.normals.of(np.concatenate([self.parts[name] for name in self.parts if name in which])).solved()
+            self.falls[which] = solved.fall, solved.rank
+        return self.falls[which]
 
 
 def _side_by_side(blocks: Sequence[Any]) -> Any:

@@ -64,9 +64,13 @@ def radial_distortion(camera: CameraModel, radius: np.ndarray) -> np.ndarray:
     """Δr at a radius, both in the unit of the image plane; see `distortion_curves`."""
     to_image = camera.direction == "object_to_image"
     q = np.asarray(radius, float) / (camera["c"] if to_image else 1.0)
+    square = q * q
 
     def polynomial(names: tuple[str, ...]) -> Array:
-        return 1 + sum((camera[name] * q ** (2 * n + 2) for n, name in enumerate(names)), np.zeros_like(q))
+        out = np.zeros_like(q)
+        for value in camera.values[[NAMES.index(name) for name in reversed(names)]].tolist():
+            out = square * (value + out)
+        return 1 + out
 
     return q * (polynomial(RADIAL) / polynomial(BELOW) - 1) * (camera["c"] if to_image else 1.0)
 

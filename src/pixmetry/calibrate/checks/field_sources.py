@@ -227,20 +227,45 @@ class _Fit:
     rank: int
     dof: float
     gain: float
-    evidence: float  # the gain as if residuals were independent: to compare fits with each other
     p: float
     factor: float
     common_px: float
     effective: float
 
 
-def _fit(camera: _Camera, beside: Beside, own: int) -> _Fit | None:
+@dataclass(frozen=True)
+class _Told:
+    """Those combinations of terms of one source that are told, as if residuals were independent."""
+
+    beside: Beside
+    size: np.ndarray
+    vectors: np.ndarray  # of the combinations
+    g: np.ndarray  # what is left of them, row by row
+    normal: np.ndarray
+    found: np.ndarray
+    before: float  # sum of squares without them
+    fall: float
+    dof: float
+    after: np.ndarray
+
+    @property
+    def rank(self) -> int:
+        return len(self.found)
+
+    @property
+    def gain(self) -> float:
+        return float(self.dof * np.log(max(self.before, 1e-300) / max(self.before - self.fall, 1e-300)))
+
+    @property
+    def cost(self) -> float:
+        return float(self.rank * np.log(self.dof))
+
+
+def _told(camera: _Camera, beside: Beside, own: int) -> _Told | None:
     """Estimate the first ``own`` terms beside the others; None where nothing of them is told.
 
     The others are taken out of them first; then the combinations of which the estimated parameters leave little are left at 0.
     """
-    from scipy import stats
-
     adjustment = camera.terms.adjustment
     rest, v = beside.rest[:, :own], beside.residual
     if beside.rest.shape[1] > own:
@@ -253,40 +278,46 @@ def _fit(camera: _Camera, beside: Beside, own: int) -> _Fit | None:
     good = values > TOLD**2
     if not good.any():
         return None
-    directions = vectors[:, good] / size[:, None]  # terms = directions @ told ones
-    g = rest @ directions
+    g = rest @ (vectors[:, good] / size[:, None])
     normal = g.T @ g
-    inverse = np.linalg.inv(normal)
-    found = inverse @ (g.T @ v)
-    fall, rank = float(found @ normal @ found), int(good.sum())
+    found = np.linalg.solve(normal, g.T @ v)
     squares = float(adjustment.sigma0**2 * adjustment.dof)
-    nuisance = beside.rest.shape[1] - own
     before = squares - (float(beside.residual @ beside.residual) - float(v @ v))
-    dof = adjustment.dof - rank - nuisance
+    dof = float(adjustment.dof - good.sum() - (beside.rest.shape[1] - own))
     if dof < 1:
         return None
-    variance = max((before - fall) / dof, 1e-300)
-    after = v - g @ found
+    return _Told(beside, size, vectors[:, good], g, normal, found, before, float(found @ normal @ found), dof, v - g @ found)
+
+
+def _fit(camera: _Camera, beside: Beside, own: int) -> _Fit | None:
+    """The first ``own`` terms beside the others, with the uncertainty that holds what residuals have in common; None where nothing of them
+    is told."""
+    told = _told(camera, beside, own)
+    return None if told is None else _with_scatter(camera, told)
+
+
+def _with_scatter(camera: _Camera, one: _Told) -> _Fit:
+    from scipy import stats
+
+    directions = one.vectors / one.size[:, None]  # terms = directions @ told ones
+    inverse = np.linalg.inv(one.normal)
+    variance = max((one.before - one.fall) / one.dof, 1e-300)
     covariance = variance * inverse
-    factor, clusters = _scatter_by_image(camera, g, after, covariance, inverse)
-    whole = camera.cells.normals
-    own_cells = np.asarray(camera.cells.white.T @ beside.rest)
-    common_px, effective = _common(camera, whole, own_cells, beside, after, variance)
-    by_cell = np.asarray(camera.cells.white.T @ g)
+    factor, clusters = _scatter_by_image(camera, one.g, one.after, covariance, one.normal)
+    own_cells = np.asarray(camera.cells.white.T @ one.beside.rest)
+    common_px, effective = _common(camera, camera.cells.normals, own_cells, one.beside, one.after, variance)
+    by_cell = np.asarray(camera.cells.white.T @ one.g)
     full = max(factor, 1.0) ** 2 * covariance + common_px**2 * inverse @ (by_cell.T @ by_cell) @ inverse
-    inflated = float(np.trace(full @ np.linalg.inv(covariance)) / rank)
-    f = float(found @ np.linalg.inv(full) @ found) / rank
-    explained, cost = float(dof * np.log(max(before, 1e-300) / max(before - fall, 1e-300))), float(rank * np.log(dof))
-    told = directions @ (vectors[:, good].T * size)
+    inflated = float(np.trace(full @ np.linalg.inv(covariance)) / one.rank)
+    f = float(one.found @ np.linalg.inv(full) @ one.found) / one.rank
     return _Fit(
-        values=directions @ found,
+        values=directions @ one.found,
         covariance=directions @ full @ directions.T,
-        told=told,
-        rank=rank,
-        dof=clusters if factor > 1 else float(dof),
-        gain=explained / inflated - cost,
-        evidence=explained - cost,
-        p=float(stats.f.sf(f, rank, dof)),
+        told=directions @ (one.vectors.T * one.size),
+        rank=one.rank,
+        dof=clusters if factor > 1 else one.dof,
+        gain=one.gain / inflated - one.cost,
+        p=float(stats.f.sf(f, one.rank, one.dof)),
         factor=factor,
         common_px=common_px,
         effective=effective,
@@ -301,22 +332,19 @@ def _image_of_rows(camera: _Camera) -> tuple[np.ndarray, int]:
     return np.repeat(out, 2), len(images)
 
 
-def _scatter_by_image(
-    camera: _Camera, g: np.ndarray, after: np.ndarray, covariance: np.ndarray, inverse: np.ndarray
-) -> tuple[float, float]:
+def _scatter_by_image(camera: _Camera, g: np.ndarray, after: np.ndarray, covariance: np.ndarray, normal: np.ndarray) -> tuple[float, float]:
     """Scatter of the images' scores over what independent residuals would give (rms over the terms), and its degrees of freedom."""
     image, count = _image_of_rows(camera)
     rank = g.shape[1]
     if count < LEAST_IMAGES:
         return 1.0, float("inf")
-    scores = np.stack([np.bincount(image[image >= 0], (g[:, k] * after)[image >= 0], count) for k in range(rank)], axis=1)
-    by_image = np.zeros((rank, rank))
-    for i in range(count):  # a jackknife: what an image would move the values by, were it left out
-        mine = image == i
-        own = g[mine].T @ g[mine]
-        moved = np.linalg.lstsq(np.linalg.inv(inverse) - own, scores[i], rcond=None)[0]
-        by_image += np.outer(moved, moved)
-    by_image *= (count - 1) / count
+    order = np.argsort(image, kind="stable")[np.count_nonzero(image < 0) :]
+    first = np.searchsorted(image[order], np.arange(count))
+    g = g[order]
+    scores = np.add.reduceat(g * after[order][:, None], first)
+    own = np.stack([part.T @ part for part in np.split(g, first[1:])])
+    moved = np.einsum("iab,ib->ia", np.linalg.pinv(normal - own, hermitian=True), scores)  # a jackknife: were the image left out
+    by_image = (count - 1) / count * moved.T @ moved
     ratio = float(np.trace(by_image @ np.linalg.inv(covariance)) / rank)
     return float(np.sqrt(ratio)), float(rank * (count - 1))
 
@@ -366,16 +394,18 @@ def _seams(camera: _Camera, others: list[Candidate], place: Place | None) -> Sea
     """Steps of the best partition of the frame."""
     terms = camera.terms
     with_others = [_dense(terms, one) for one in others]
-    best: tuple[tuple[int, int], _Fit] | None = None
+    best: tuple[tuple[int, int], _Told] | None = None
+    least = -np.inf
     for layout in LAYOUTS:
         shift = field_terms(camera.x, camera.y, *camera.size, layout)
         beside = terms.beside(np.hstack([terms.as_rows(camera.along(shift)), *with_others]))
-        fit = _fit(camera, beside, shift[0].shape[1])
-        if fit is not None and (best is None or fit.evidence > FINER * abs(best[1].evidence) + best[1].evidence + STRONG):
-            best = layout, fit
+        told = _told(camera, beside, shift[0].shape[1])
+        evidence = -np.inf if told is None else told.gain - told.cost
+        if told is not None and (best is None or evidence > FINER * abs(least) + least + STRONG):
+            best, least = (layout, told), evidence
     if best is None:
         return None
-    layout, fit = best
+    layout, fit = best[0], _with_scatter(camera, best[1])
     gain = fit.gain
     fields = layout[0] * layout[1]
     enough = len(np.unique(camera.image)) >= LEAST_TOLD

@@ -25,6 +25,12 @@ from pixmetry.core.arrays import Array, Flags, Ints
 from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.finding import Finding
 
+SHARED = {
+    "image": "in one image",
+    "frame": "at one place of the frame in all images",
+    "view": "in images from similar directions",
+    "oblique": "of targets seen obliquely",
+}
 LEAST_IMAGES = 6  # of a camera, to be halved
 RARE = 0.01
 EVERY_OTHER, IN_ORDER = "every other image", "the first and the second half"
@@ -132,18 +138,24 @@ def halves_findings(found: Mapping[str, tuple[Halves, ...]]) -> list[Finding]:
     return out
 
 
+def shared_words(one: SharedByCamera) -> tuple[str, list[str]]:
+    """Whether image points have such errors, or may have them (the shift of oblique targets counts from a lower level on); their sizes."""
+    sure = any(size > 0 and (kind != "oblique" or p < RARE) for kind, size, p in zip(one.kinds, one.rms_px, one.p, strict=True))
+    parts = [f"{size:.3f} px {SHARED[kind]}" for kind, size in zip(one.kinds, one.rms_px, strict=True) if size >= 5e-4]
+    return "have" if sure else "may have", parts or ["less than 0.001 px"]
+
+
 def shared_findings(found: Mapping[str, SharedByCamera]) -> list[Finding]:
     """Errors that image points share, and what they did to the uncertainties."""
     from scipy import stats
 
-    words = {"image": "in one image", "frame": "at one place of the frame in all images", "view": "in images from similar directions"}
     out = []
     for camera, one in found.items():
         if not one.found:
             continue
-        parts = [f"{size:.3f} px {words[kind]}" for kind, size in zip(one.kinds, one.rms_px, strict=True) if size >= 5e-4]
+        have, parts = shared_words(one)
         text = (
-            f"{camera}: image points have errors in common ({', '.join(parts)}; independent: {one.independent_px:.3f} px). The stated "
+            f"{camera}: image points {have} errors in common ({', '.join(parts)}; independent: {one.independent_px:.3f} px). The stated "
             "uncertainties hold them"
         )
         if one.names:

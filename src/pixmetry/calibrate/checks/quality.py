@@ -121,8 +121,8 @@ def shared_records(adjustment: Adjustment) -> dict[str, SharedByCamera] | None:
     if shared is None:
         return None
     for k, camera in enumerate(network.cameras):
-        own = [i for i, (_, of) in enumerate(shared.kinds) if of in (k, -1)]
-        own = [i for i in own if shared.kinds[i][1] == k] or own
+        alone = {kind for kind, of in shared.kinds if of == k}
+        own = [i for i, (kind, of) in enumerate(shared.kinds) if of == k or (of == -1 and kind not in alone)]
         rows = adjustment.used & (network.camera_of[network.image] == k)
         if not own or not rows.any():
             continue

@@ -41,6 +41,7 @@ def tests_of(
     *,
     stated: Adjustment | None = None,
     a_priori: bool = False,
+    patterns: bool = True,
 ) -> Tests:
     """The tests that follow from one adjustment alone (with redundancy numbers and covariance).
 
@@ -59,13 +60,15 @@ def tests_of(
         The same with the uncertainties that are stated, where these hold more than independent errors.
     a_priori : bool
         Whether the covariances of the adjustment are without sigma0².
+    patterns : bool
+        Search the residuals for patterns.
     """
     from pixmetry.calibrate.bundle.bundle import adjust
 
     stated = stated or adjustment
     oriented = dict(zip(adjustment.network.images, adjustment.state.posed, strict=True))
     gross = tuple(error for error in gross_error_records(adjustment, alpha, rejected) if oriented[error.image])
-    searched = searched_without_bad_images(adjustment, adjust)
+    searched = searched_without_bad_images(adjustment, adjust) if patterns else None
     return Tests(
         parameters=quality.parameter_records(stated),
         parameter_groups=quality.group_records(stated),
@@ -75,8 +78,8 @@ def tests_of(
         residuals=_with_noise(quality.residual_records(adjustment), adjustment, given),
         f_test=quality.f_test_records(adjustment),
         gross_errors=gross,
-        patterns=searched.patterns,
-        field_sources=searched.sources or None,
+        patterns=None if searched is None else searched.patterns,
+        field_sources=None if searched is None else searched.sources or None,
         images=quality.image_records(stated, Counter(error.image for error in gross)),
         curves=curves.distortion_curves(stated),
         projection=curves.projection_maps(stated),

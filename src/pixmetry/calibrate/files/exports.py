@@ -7,6 +7,7 @@ References
 ----------
 ROS, sensor_msgs/CameraInfo and camera_calibration_parsers (the YAML file); Kalibr, wiki page "yaml formats" (camchain.yaml); mrcal, "Camera
 model representation" (.cameramodel); Agisoft Metashape Professional user manual, appendix "Camera models"; MathWorks, cameraIntrinsics.
+HALCON, Australis and PhotoModeler are in `pixmetry.calibrate.files.photogrammetric`.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from pixmetry.calibrate.exchange import (
     RATIONAL,
     STORAGES,
     Converted,
+    Known,
     colmap_line,
     colmap_names,
     converted,
@@ -34,6 +36,15 @@ from pixmetry.calibrate.exchange import (
     opencv_names,
     opencv_text,
     vision_values,
+)
+from pixmetry.calibrate.files.photogrammetric import (
+    AUSTRALIS,
+    DIVISION,
+    HALCON,
+    australis_text,
+    halcon_text,
+    photomodeler_text,
+    square_affinity,
 )
 from pixmetry.calibrate.records import RigRecord
 from pixmetry.core.errors import InputError
@@ -53,9 +64,22 @@ OPENCV_MARKS = {
 }
 XML_MARK = re.compile(rb'<\?xml version="1\.0" encoding="UTF-8"\?>\s*<!-- Written by pixmetry ')
 MATLAB_MARK = re.compile(rb"% Written by pixmetry ")
+AUSTRALIS_MARK = re.compile(rb"Australis Bundle Adjustment Results: Camera Parameters\s+Written by pixmetry ")
+PHOTOMODELER_MARK = re.compile(rb"Status Report Tree\s+Project Name: written by pixmetry ")
 RADTAN, EQUIDISTANT = ("c", "xp", "yp", "b1", "k1", "k2", "p1", "p2"), ("c", "xp", "yp", "b1", "k1", "k2", "k3", "k4")
 METASHAPE = ("c", "xp", "yp", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2")
+PHOTOGRAMMETRIC: dict[str, tuple[str, ...]] = {"halcon": HALCON, "australis": AUSTRALIS, "photomodeler": HALCON}
 MATLAB = ("c", "xp", "yp", "b1", "b2", "k1", "k2", "k3", "p1", "p2")
+
+
+@dataclass(frozen=True)
+class Told:
+    """What a format is told beside the cameras: the ending of its file, what may be lost, the rig, and how well cameras are known."""
+
+    ending: str
+    may_lose_px: float
+    rig: RigRecord | None
+    known: Mapping[str, Known]
 
 
 @dataclass(frozen=True)
@@ -71,7 +95,7 @@ class Format:
     together : bool
         Whether all cameras are in one file; otherwise each has a file of its own.
     text : callable
-        Of (cameras, ending, may_lose_px, rig) the text of one file.
+        Of (cameras, what else is told) the text of one file.
     marks : mapping of str to pattern
         By ending: how a file that was written here begins.
     """
@@ -79,7 +103,7 @@ class Format:
     title: str
     endings: tuple[str, ...]
     together: bool
-    text: Callable[[Sequence[CameraModel], str, float, RigRecord | None], str]
+    text: Callable[[Sequence[CameraModel], Told], str]
     marks: Mapping[str, re.Pattern[bytes]]
 
 
@@ -237,17 +261,24 @@ def _marked(endings: Iterable[str], mark: re.Pattern[bytes] = REMARK) -> dict[st
 
 
 FORMATS: dict[str, Format] = {
-    "opencv": Format("OpenCV", STORAGES, False, lambda models, ending, lose, rig: opencv_text(models[0], ending, lose), OPENCV_MARKS),
-    "colmap": Format("COLMAP", (".txt",), True, lambda models, ending, lose, rig: colmap_text(models, lose), _marked([".txt"])),
-    "ros": Format("ROS", (".yaml", ".yml"), False, lambda models, ending, lose, rig: ros_text(models[0], lose), _marked([".yaml", ".yml"])),
-    "kalibr": Format("Kalibr", (".yaml", ".yml"), True, lambda models, ending, lose, rig: kalibr_text(models, lose, rig),
+    "opencv": Format("OpenCV", STORAGES, False, lambda models, told: opencv_text(models[0], told.ending, told.may_lose_px,
+                                                                                 told.known.get(models[0].name)), OPENCV_MARKS),
+    "colmap": Format("COLMAP", (".txt",), True, lambda models, told: colmap_text(models, told.may_lose_px), _marked([".txt"])),
+    "ros": Format("ROS", (".yaml", ".yml"), False, lambda models, told: ros_text(models[0], told.may_lose_px), _marked([".yaml", ".yml"])),
+    "kalibr": Format("Kalibr", (".yaml", ".yml"), True, lambda models, told: kalibr_text(models, told.may_lose_px, told.rig),
                      _marked([".yaml", ".yml"])),
-    "mrcal": Format("mrcal", (".cameramodel",), False, lambda models, ending, lose, rig: mrcal_text(models[0], lose, rig),
+    "mrcal": Format("mrcal", (".cameramodel",), False, lambda models, told: mrcal_text(models[0], told.may_lose_px, told.rig),
                     _marked([".cameramodel"])),
-    "metashape": Format("Metashape", (".xml",), False, lambda models, ending, lose, rig: metashape_text(models[0], lose),
+    "metashape": Format("Metashape", (".xml",), False, lambda models, told: metashape_text(models[0], told.may_lose_px),
                         _marked([".xml"], XML_MARK)),
-    "matlab": Format("MATLAB", (".m",), False, lambda models, ending, lose, rig: matlab_text(models[0], lose),
+    "matlab": Format("MATLAB", (".m",), False, lambda models, told: matlab_text(models[0], told.may_lose_px),
                      _marked([".m"], MATLAB_MARK)),
+    "halcon": Format("HALCON", (".dat", ".cal"), False, lambda models, told: halcon_text(models[0], told.may_lose_px),
+                     _marked([".dat", ".cal"])),
+    "australis": Format("Australis", (".txt",), True, lambda models, told: australis_text(models, told.may_lose_px, told.known),
+                        _marked([".txt"], AUSTRALIS_MARK)),
+    "photomodeler": Format("PhotoModeler", (".txt",), True, lambda models, told: photomodeler_text(models, told.may_lose_px, told.known),
+                           _marked([".txt"], PHOTOMODELER_MARK)),
 }  # fmt: skip
 
 
@@ -294,6 +325,7 @@ def write_exports(
     may_lose_px: float = 0.0,
     sources: Iterable[Path] = (),
     rig: RigRecord | None = None,
+    known: Mapping[str, Known] | None = None,
 ) -> Exported:
     """Write each file that its format can hold; of those that exist, only earlier exports are replaced.
 
@@ -308,6 +340,8 @@ def write_exports(
         Files that must not be replaced.
     rig : RigRecord, optional
         How the cameras stand, for formats that say it.
+    known : mapping of str to Known, optional
+        How well the cameras are known, by their names, for formats that have a place for it.
 
     Returns
     -------
@@ -330,7 +364,7 @@ def write_exports(
         one = FORMATS[name]
         for place, own in [(path, cameras)] if one.together else _places(cameras, path):
             try:
-                text = one.text(own, path.suffix.lower(), may_lose_px, rig)
+                text = one.text(own, Told(path.suffix.lower(), may_lose_px, rig, known or {}))
                 told += [_sentence(name, place, model, k) for k, model in enumerate(own)]
             except InputError as problem:
                 refused.append((place, problem))
@@ -356,6 +390,10 @@ def _places(cameras: list[CameraModel], path: Path) -> list[tuple[Path, list[Cam
 
 def _found(name: str, model: CameraModel) -> Converted:
     """The model as a format holds it."""
+    if name in PHOTOGRAMMETRIC:
+        division = name == "halcon" and model["d1"] and not any(model[one] for one in HALCON[3:])
+        sensor = model.sensor if name == "australis" else square_affinity(model).sensor
+        return converted(model, "image_to_object", DIVISION if division else PHOTOGRAMMETRIC[name], "perspective", sensor)
     if name == "mrcal" and model.projection == "stereographic":
         return converted(model, "object_to_image", ("c", "xp", "yp", "b1"), "stereographic")
     if model.projection != "perspective" and name != "matlab":

@@ -1,4 +1,7 @@
-"""Cameras from the files of other programs: ROS, Kalibr, mrcal and Metashape; OpenCV and COLMAP are in `pixmetry.calibrate.exchange`."""
+"""Cameras from the files of other programs: ROS, Kalibr, mrcal, Metashape, HALCON, Australis and PhotoModeler.
+
+OpenCV and COLMAP are in `pixmetry.calibrate.exchange`.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +16,7 @@ import numpy as np
 
 from pixmetry.calibrate.bundle.model import CameraModel, Sensor
 from pixmetry.calibrate.exchange import model_of_opencv
+from pixmetry.calibrate.files.photogrammetric import camera_of_halcon, cameras_of_australis, cameras_of_photomodeler
 from pixmetry.core.config import load_yaml, read_text
 from pixmetry.core.errors import InputError
 
@@ -22,8 +26,14 @@ KEYS = ("distortion_model:", "distortion_coeffs:")  # of a YAML file of ROS, and
 METASHAPE = {"frame": "perspective", "fisheye": "equidistant", "equidistant_fisheye": "equidistant", "equisolid_fisheye": "equisolid"}
 
 
-def read_cameras(path: str | Path) -> dict[str, CameraModel] | None:
+def read_cameras(path: str | Path, size: tuple[int, int] | None = None) -> dict[str, CameraModel] | None:
     """Cameras of a file by their names; None where it is of none of these programs.
+
+    Parameters
+    ----------
+    path : path
+    size : (int, int), optional
+        Columns and rows of the frame, for a file that does not say them (PhotoModeler).
 
     Raises
     ------
@@ -44,6 +54,12 @@ def read_cameras(path: str | Path) -> dict[str, CameraModel] | None:
             return {source.stem: _of_mrcal(ast.literal_eval(_without_remarks(text)), str(source))}
         if ending == ".xml" and "<calibration>" in text and "opencv_storage" not in text:
             return {source.stem: _of_metashape(text, str(source))}
+        if ending in (".dat", ".cal") and "ParGroup" in text:
+            return {source.stem: camera_of_halcon(text, str(source))}
+        if ending == ".txt" and "Camera Parameters" in text[:400]:
+            return cameras_of_australis(text, str(source))
+        if ending == ".txt" and "Camera Calibration Standard Deviations" in text:
+            return cameras_of_photomodeler(text, str(source), size)
         if ending in (".yaml", ".yml") and not text.lstrip().startswith("%YAML") and any(key in text for key in KEYS):
             return _of_yaml(load_yaml(source), str(source))
     except (KeyError, ValueError, TypeError, SyntaxError, IndexError, ElementTree.ParseError) as problem:

@@ -8,9 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pixmetry.core.errors import InputError
+from pixmetry.locate.detect.coded import QUIET_OUTER, RING_INNER, RING_OUTER, RINGS_OF_12, codes, segments_of
 
-KINDS = ("chessboard", "dots", "squares", "charuco", "aprilgrid")
-DICTIONARY = {"charuco": "5X5_1000", "aprilgrid": "APRILTAG_36h11"}
+KINDS = ("chessboard", "dots", "asymmetric", "squares", "charuco", "aprilgrid", "coded")
+DICTIONARY = {"charuco": "5X5_1000", "aprilgrid": "APRILTAG_36h11", "coded": RINGS_OF_12}
 MARGIN = 1.0  # white around the targets, in pitches
 CAPTION_MM, CAPTION_PT = 8.0, 7.0
 KALIBR_BORDER = 2  # bits of black about the code of a tag
@@ -34,6 +35,8 @@ class PrintedBoard:
         x, y, radius.
     box : (float, float, float, float)
         x, y, width and height of the sheet.
+    sectors : ndarray, shape (k, 6)
+        Parts of rings: x, y, outer radius, width, and the angles in degrees from x towards y between which they lie.
     """
 
     title: str
@@ -42,6 +45,7 @@ class PrintedBoard:
     black: np.ndarray = field(default_factory=lambda: np.zeros((0, 4)))
     discs: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
     box: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    sectors: np.ndarray = field(default_factory=lambda: np.zeros((0, 6)))
 
     def coordinates_csv(self) -> str:
         """Nominal coordinates as a table that a project's ``points`` reads."""
@@ -59,7 +63,7 @@ class PrintedBoard:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.collections import EllipseCollection, PatchCollection
         from matplotlib.figure import Figure
-        from matplotlib.patches import Rectangle
+        from matplotlib.patches import Patch, Rectangle, Wedge
 
         x, y, width, height = self.box
         figure = Figure((width / MM_PER_INCH, (height + CAPTION_MM) / MM_PER_INCH))
@@ -67,7 +71,8 @@ class PrintedBoard:
         axes = figure.add_axes((0, 0, 1, 1))
         axes.set(xlim=(x, x + width), ylim=(y + height + CAPTION_MM, y))
         axes.set_axis_off()
-        patches = [Rectangle((left, top), wide, high) for left, top, wide, high in self.black]
+        patches: list[Patch] = [Rectangle((left, top), wide, high) for left, top, wide, high in self.black]
+        patches += [Wedge((u, v), radius, first, last, width=wide) for u, v, radius, wide, first, last in self.sectors]
         axes.add_collection(PatchCollection(patches, facecolor="black", edgecolor="none", linewidth=0, antialiased=False))
         if len(self.discs):
             size = 2 * self.discs[:, 2]
@@ -101,18 +106,18 @@ def board_of(
 
     Parameters
     ----------
-    kind : {"chessboard", "dots", "squares", "charuco", "aprilgrid"}
+    kind : {"chessboard", "dots", "asymmetric", "squares", "charuco", "aprilgrid", "coded"}
     grid : (int, int)
-        Columns and rows, as ``calibrate`` takes them: of inner corners, dots, separate squares; of squares of a chessboard with markers; of
-        tags.
+        Columns and rows, as ``calibrate`` takes them: of inner corners, dots (of an asymmetric plate: dots a row, and rows), separate
+        squares; of squares of a chessboard with markers; of tags; of coded targets, which ``calibrate`` takes without.
     pitch_mm : float
-        From one to the next.
+        From one to the next; of an asymmetric plate in its row.
     side_mm : float, optional
         Of separate squares, markers or tags: by default half of the pitch, 3/4 and 10/13 of it.
     diameter_mm : float, optional
-        Of dots, by default half of the pitch.
+        Of dots, by default half of the pitch (asymmetric: 0.35 of it); of the discs of coded targets, by default 0.22 of it.
     dictionary : str, optional
-        Of markers: 5X5_1000 or, of tags, APRILTAG_36h11 by default.
+        Of markers: 5X5_1000, of tags APRILTAG_36h11, of coded targets RING_12 by default.
 
     Raises
     ------
@@ -132,29 +137,34 @@ def board_of(
         raise InputError("not the size of a board", where="grid", value=f"{cols}x{rows}", allowed="COLSxROWS, 3x3 to 500x500")
     if not 0 < pitch_mm < 1e4:
         raise InputError("not a spacing", where="pitch_mm", value=pitch_mm, allowed="above 0, in mm")
-    shares = {"squares": 0.5, "charuco": 0.75, "aprilgrid": 10 / 13}
-    for name, value, has in (("side_mm", side_mm, kind in shares), ("diameter_mm", diameter_mm, kind == "dots"),
+    shares, dots = {"squares": 0.5, "charuco": 0.75, "aprilgrid": 10 / 13}, {"dots": 0.5, "asymmetric": 0.35, "coded": 0.22}
+    for name, value, has in (("side_mm", side_mm, kind in shares), ("diameter_mm", diameter_mm, kind in dots),
                              ("dictionary", dictionary, kind in DICTIONARY)):  # fmt: skip
         if value is not None and not has:
             raise InputError(f"has no meaning for a board of kind {kind}", where=name, value=value, remedy="leave it out")
     side = side_mm if side_mm is not None else round(shares.get(kind, 0.5) * pitch_mm, 4)
-    diameter = diameter_mm if diameter_mm is not None else 0.5 * pitch_mm
-    if not 0 < side < pitch_mm or not 0 < diameter < pitch_mm:
-        value = diameter if kind == "dots" else side
+    diameter = diameter_mm if diameter_mm is not None else round(dots.get(kind, 0.5) * pitch_mm, 4)
+    most = {"asymmetric": pitch_mm / 2**0.5, "coded": pitch_mm / QUIET_OUTER}.get(kind, pitch_mm)  # to the nearest neighbour; with its ring
+    if not 0 < side < pitch_mm or not 0 < diameter < most:
+        value = diameter if kind in dots else side
         raise InputError(
             "targets do not fit into their spacing", where="side_mm, diameter_mm", value=value, allowed="between 0 and the pitch"
         )
     words = dictionary or DICTIONARY.get(kind, "")
-    draw = {"chessboard": _chessboard, "dots": _dots, "squares": _squares, "charuco": _charuco, "aprilgrid": _aprilgrid}[kind]
-    points, black, discs = draw(cols, rows, pitch_mm, diameter if kind == "dots" else side, words)
+    sectors = np.zeros((0, 6))
+    if kind == "coded":
+        points, discs, sectors = _coded(cols, rows, pitch_mm, diameter, segments_of(words))
+        black = NO_SQUARES
+    else:
+        points, black, discs = DRAWINGS[kind](cols, rows, pitch_mm, diameter if kind in dots else side, words)
     solid = np.concatenate([black, np.column_stack([discs[:, :2] - discs[:, 2:], 2 * discs[:, 2:], 2 * discs[:, 2:]])])
     low, high = solid[:, :2].min(axis=0) - MARGIN * pitch_mm, (solid[:, :2] + solid[:, 2:]).max(axis=0) + MARGIN * pitch_mm
-    more = f" --diameter-mm {diameter:.9g}" if kind == "dots" else f" --side-mm {side:.9g}" if kind in shares else ""
+    more = f" --diameter-mm {diameter:.9g}" if kind in dots else f" --side-mm {side:.9g}" if kind in shares else ""
     more += f" --dictionary {words}" if kind in DICTIONARY else ""
-    options = f"--kind {kind} --grid {cols}x{rows} --pitch-mm {pitch_mm:.9g}{more}"
-    return PrintedBoard(
-        f"{kind}, {cols} × {rows}, pitch {pitch_mm:.9g} mm", options, points, black, discs, (*low.tolist(), *(high - low).tolist())
-    )
+    size = "" if kind == "coded" else f" --grid {cols}x{rows} --pitch-mm {pitch_mm:.9g}"
+    title = f"{kind}, {cols} × {rows}, pitch {pitch_mm:.9g} mm"
+    box = (*low.tolist(), *(high - low).tolist())
+    return PrintedBoard(title, f"--kind {kind}{size}{more}", points, black, discs, box, sectors)
 
 
 Drawn = tuple[dict[str, tuple[float, float]], np.ndarray, np.ndarray]
@@ -178,6 +188,29 @@ def _chessboard(cols: int, rows: int, pitch: float, side: float, dictionary: str
 def _dots(cols: int, rows: int, pitch: float, diameter: float, dictionary: str) -> Drawn:
     points = _lattice(cols, rows, pitch)
     return points, NO_SQUARES, np.array([(x, y, diameter / 2) for x, y in points.values()])
+
+
+def _asymmetric(cols: int, rows: int, pitch: float, diameter: float, dictionary: str) -> Drawn:
+    """As OpenCV has it: odd rows are half a step further, rows half a step apart."""
+    points = {f"{r}/{c}": ((c + 0.5 * (r % 2)) * pitch, 0.5 * r * pitch) for r in range(rows) for c in range(cols)}
+    return points, NO_SQUARES, np.array([(x, y, diameter / 2) for x, y in points.values()])
+
+
+def _coded(cols: int, rows: int, pitch: float, diameter: float, bits: int) -> tuple[dict[str, tuple[float, float]], np.ndarray, np.ndarray]:
+    """Discs in rings of segments, the numbers in use along the rows; what is set in a number is printed."""
+    numbers, radius = codes(bits), diameter / 2
+    if cols * rows > len(numbers):
+        allowed = f"at most {len(numbers)} targets"
+        raise InputError(f"there are not so many codes of {bits} segments", where="grid", value=f"{cols}x{rows}", allowed=allowed)
+    points = {str(numbers[r * cols + c]): (c * pitch, r * pitch) for r in range(rows) for c in range(cols)}
+    step, wide = 360 / bits, (RING_OUTER - RING_INNER) * radius
+    sectors = [
+        (x, y, RING_OUTER * radius, wide, bit * step, (bit + 1) * step)
+        for number, (x, y) in points.items()
+        for bit in range(bits)
+        if int(number) >> bit & 1
+    ]
+    return points, np.array([(x, y, radius) for x, y in points.values()]), np.array(sectors)
 
 
 def _tag_points(cols: int, rows: int, pitch: float, side: float) -> dict[str, tuple[float, float]]:
@@ -225,3 +258,7 @@ def _aprilgrid(cols: int, rows: int, pitch: float, side: float, dictionary: str)
             black += _marker(dictionary, (rows - 1 - r) * cols + c, KALIBR_BORDER, c * pitch, r * pitch, side)
     black += [(c * pitch - gap, r * pitch - gap, gap, gap) for r in range(rows + 1) for c in range(cols + 1)]
     return _tag_points(cols, rows, pitch, side), np.array(black), NO_DISCS
+
+
+DRAWINGS = {"chessboard": _chessboard, "dots": _dots, "asymmetric": _asymmetric, "squares": _squares, "charuco": _charuco,
+            "aprilgrid": _aprilgrid}  # fmt: skip

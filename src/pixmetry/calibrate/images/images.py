@@ -141,7 +141,8 @@ def observations_of(
     noise : optional
         As in `pixmetry.locate`; by default it is measured in each image.
     dictionary : str, optional
-        Of the markers: ``5X5_1000`` of a charuco board and ``APRILTAG_36h11`` of tags by default.
+        Of the markers: ``5X5_1000`` of a charuco board and ``APRILTAG_36h11`` of tags by default. Of coded targets ``RING_8``, ``RING_12``
+        (the default), ``RING_14``, ``RING_16`` or ``RING_20``, by the segments of their rings.
     least_images : int
         From how many usable images on there is a result.
     threads : int, optional
@@ -168,7 +169,7 @@ def observations_of(
     sides = (np.nan, np.nan) if side is None else (side / step[0], side / step[1])
     layout = layout_of(raw)
     if dictionary is not None and kind not in DICTIONARIES:
-        raise InputError("a dictionary is one of markers", where="dictionary", value=dictionary, allowed="with charuco or aprilgrid")
+        raise InputError("a dictionary is one of markers", where="dictionary", value=dictionary, allowed="with charuco, aprilgrid or coded")
     markers = dictionary or DICTIONARIES.get(kind, "")
     wanted = Wanted(kind, size, sides, polarity, channel, noise_model(noise), threads, layout, markers)
     items = _items(images, layout)

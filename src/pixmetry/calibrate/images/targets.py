@@ -13,6 +13,7 @@ from pixmetry.core.errors import InputError
 from pixmetry.files.formats import Decoded
 from pixmetry.files.images import load_picture
 from pixmetry.files.raw_values import RawLayout
+from pixmetry.locate.detect.coded import RINGS_OF_12
 from pixmetry.locate.detect.grids import LEAST_WHOLE, Grid
 from pixmetry.locate.detect.targets import Flag, Positions
 from pixmetry.locate.frame import checked_frame, scale_ends
@@ -22,10 +23,11 @@ from pixmetry.locate.records import Located
 
 KINDS = ("chessboard", "dots", "asymmetric", "squares", "coded", "charuco", "aprilgrid")
 NUMBERED = ("coded", "charuco", "aprilgrid")  # whose targets carry numbers: part of a board suffices
-DICTIONARIES = {"charuco": "5X5_1000", "aprilgrid": "APRILTAG_36h11"}  # of markers, unless another one is named
+DICTIONARIES = {"charuco": "5X5_1000", "aprilgrid": "APRILTAG_36h11", "coded": RINGS_OF_12}  # unless another one is named
 LEAST_SHARE = 0.5  # of a board's points, that an image must show to be used
 MARKER_GAP, MARKER_CLEARANCE_PX = 0.7, 2.0  # from a corner to the next marker, over what that leaves of a square; for its blur
-LEAST_NUMBERED, MOST_MOVED_PX = 8, 6.0  # corners in an image; of one from where it was seen
+LEAST_NUMBERED = 8  # corners in an image
+MOST_MOVED, MOVED_PX = 0.2, (2.0, 6.0)  # of a corner from where it was seen: of the distance to the next one, within these limits
 LEAST_CODES = 4  # targets in an image
 UNUSABLE = Flag.NOT_CONVERGED | Flag.BORDER
 
@@ -46,7 +48,7 @@ class Wanted:
     raw : RawLayout, optional
         Of files without a header.
     dictionary : str
-        Of markers.
+        Of markers, or of the codes of coded targets.
     """
 
     kind: str
@@ -146,7 +148,10 @@ def _seen(name: str, frame: np.ndarray, found: Located | Positions, keys: np.nda
 
 def _located(name: str, frame: np.ndarray, kind: str, wanted: Wanted, grid: str | tuple[int, int] | None = None) -> Located:
     polarity = "auto" if kind == "chessboard" else wanted.polarity
-    return locate(frame, kind=kind, grid=grid, polarity=polarity, noise=wanted.noise, threads=wanted.threads, name=name)
+    words = wanted.dictionary if kind == "coded" else RINGS_OF_12
+    return locate(
+        frame, kind=kind, grid=grid, polarity=polarity, noise=wanted.noise, dictionary=words, threads=wanted.threads, name=name
+    )
 
 
 def _chessboard(name: str, frame: np.ndarray, wanted: Wanted) -> Seen:
@@ -212,6 +217,8 @@ def _squares(name: str, frame: np.ndarray, wanted: Wanted) -> Seen:
 
 def _coded(name: str, frame: np.ndarray, wanted: Wanted) -> Seen:
     found = _located(name, frame, "coded", wanted)
+    if "rings" in found.images[0]:
+        return _nothing(name, frame, found.images[0]["rings"])
     numbers, counts = np.unique(found["code"][found["code"] >= 0], return_counts=True)
     use = _usable(found) & np.isin(found["code"], numbers[counts == 1])
     if use.sum() < LEAST_CODES:
@@ -259,8 +266,12 @@ def _numbered(name: str, frame: np.ndarray, found: Positions, grid: Grid) -> See
     """Corners of markers that were identified, without those that the fit moved where their neighbours do not expect them."""
     use, keys = _usable(found), np.column_stack([grid.row, grid.col])
     if use.sum() >= LEAST_NUMBERED:
+        from scipy.spatial import cKDTree
+
+        place = np.column_stack([grid.x_px, grid.y_px])
+        next_px = cKDTree(place).query(place, k=2)[0][:, 1]
         moved = np.hypot(found.x_px - grid.x_px, found.y_px - grid.y_px)
-        use &= np.nan_to_num(moved, nan=np.inf) < MOST_MOVED_PX
+        use &= np.nan_to_num(moved, nan=np.inf) < np.clip(MOST_MOVED * next_px, *MOVED_PX)
     if use.sum() < LEAST_NUMBERED:
         return _nothing(name, frame, f"{int(use.sum())} numbered corners could be measured, {LEAST_NUMBERED} are needed")
     return _seen(name, frame, found, keys, use, (grid.rows, grid.cols))

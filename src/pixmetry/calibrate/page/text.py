@@ -54,7 +54,6 @@ TITLES = {
     **{f"d{n}": "Radial, denominator" for n in range(1, 4)},
     **{f"s{n}": "Thin prism" for n in range(1, 5)},
 }
-SHARED = {"image": "in one image", "frame": "at one place of the frame in all images", "view": "in images from similar directions"}
 DIRECTIONS = {
     "image_to_object": "corrects image coordinates (image to object, as in photogrammetry)",
     "object_to_image": "distorts ideal directions (object to image, as in computer vision)",
@@ -163,8 +162,11 @@ def shared_text(shared: SharedByCamera) -> str:
     """Whether errors of image points are independent, and what that does to u."""
     if not shared.found:
         return "The residuals show no errors that image points have in common: u is that of independent errors."
-    parts = [f"{size:.3f}{NO_BREAK}px {SHARED[kind]}" for kind, size in zip(shared.kinds, shared.rms_px, strict=True) if size >= 5e-4]
-    text = f"Image points have errors in common: {', '.join(parts)}; {shared.independent_px:.3f}{NO_BREAK}px are independent."
+    from pixmetry.calibrate.checks.parts import shared_words
+
+    have, parts = shared_words(shared)
+    sizes = ", ".join(parts).replace(" px", f"{NO_BREAK}px")
+    text = f"Image points {have} errors in common: {sizes}; {shared.independent_px:.3f}{NO_BREAK}px are independent."
     if not shared.names:
         return f"{text} The uncertainties of poses and points hold them."
     low, high = (f"{one:.1f}" for one in (shared.widened.min(), shared.widened.max()))

@@ -31,7 +31,7 @@ from pixmetry.files.files import find_file
 Pitch = tuple[float | None, float | None]
 MIRRORED = ("b2", "p2", "s3", "s4")  # with y the other way round they change their sign, in both directions; yp is a place
 CLOCK, READ_OUT, WINDOW = "grabber.sampling_clock", "sensor.read_out", "grabber.window_offset"
-ENDINGS = (".json", ".yaml", ".yml", ".xml", ".txt", ".cameramodel")
+ENDINGS = (".json", ".yaml", ".yml", ".xml", ".txt", ".cameramodel", ".dat", ".cal")
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ def described(entry: CameraEntry, reader: Reader, k: int, *, straight: bool = Fa
         If a file or preset cannot be used, sizes differ, or c is to be held without a value.
     """
     preset = None if entry.camera is None else _preset(entry.camera, reader, k)
-    start = None if entry.start_from is None else _start(entry.start_from, entry.name, reader, k)
+    start = None if entry.start_from is None else _start(entry, reader, k)
     cols, rows = entry.cols, entry.rows
     pitch: Pitch = (entry.pitch_x_um or entry.pitch_um, entry.pitch_y_um or entry.pitch_um)
     if preset is not None:
@@ -153,10 +153,11 @@ def _preset(name: str, reader: Reader, k: int) -> Camera:
     return camera
 
 
-def _start(file: str, name: str, reader: Reader, k: int) -> CameraModel:
-    path = find_file(reader.folder, file, reader.where("cameras", k, "start_from"))
+def _start(entry: CameraEntry, reader: Reader, k: int) -> CameraModel:
+    assert entry.start_from is not None
+    path = find_file(reader.folder, entry.start_from, reader.where("cameras", k, "start_from"))
     reader.files.append(path)
-    return read_start(path, name)
+    return read_start(path, entry.name, (entry.cols, entry.rows) if entry.cols and entry.rows else None)
 
 
 @dataclass(frozen=True)
@@ -226,8 +227,15 @@ def check_size(camera: Camera, size: Sequence[int], where: str, what: str) -> No
         raise InputError(f"{what} another size than the frames of {camera.name}", where=where, value=found, allowed=allowed, remedy=remedy)
 
 
-def read_start(path: Path, name: str) -> CameraModel:
+def read_start(path: Path, name: str, size: tuple[int, int] | None = None) -> CameraModel:
     """The camera that a file holds; of several the one of this name (COLMAP: CAMERA_ID).
+
+    Parameters
+    ----------
+    path : Path
+    name : str
+    size : (int, int), optional
+        Columns and rows of the frame, for a file that does not say them.
 
     Raises
     ------
@@ -235,15 +243,23 @@ def read_start(path: Path, name: str) -> CameraModel:
         If the file cannot be read, or does not say which camera is meant.
     """
     if path.suffix.lower() not in ENDINGS:
-        allowed = "calibration.json, COLMAP's cameras.txt, a file of OpenCV (.yaml, .yml, .xml, .json), ROS, Kalibr, mrcal or Metashape"
+        allowed = (
+            "calibration.json, COLMAP's cameras.txt, a file of OpenCV (.yaml, .yml, .xml, .json), ROS, Kalibr, mrcal, Metashape, HALCON "
+            "(.dat, .cal), or a report of Australis or PhotoModeler (.txt)"
+        )
         raise InputError("no start values can be read from such a file", where=str(path), value=path.suffix, allowed=allowed)
+    others = read_cameras(path, size)
+    if others is not None:
+        return _of_name(others, name, path, lambda model: model)
+    if path.suffix.lower() in (".dat", ".cal"):
+        allowed = "ParGroup: Camera: Parameter, as write_cam_par writes"
+        raise InputError("not the camera parameters of HALCON", where=str(path), allowed=allowed)
     if path.suffix.lower() == ".txt":
         lines = [line for line in read_text(path).splitlines() if line.strip() and not line.startswith("#")]
         return _of_name({line.split()[0]: line for line in lines}, name, path, model_of_colmap)
     if path.suffix.lower() == ".json" and _is_ours(path):
         return _of_name({model.name: model for model in stored_cameras(path)}, name, path, lambda model: model)
-    others = read_cameras(path)
-    return _of_name(others, name, path, lambda model: model) if others is not None else read_opencv(path)
+    return read_opencv(path)
 
 
 def _is_ours(path: Path) -> bool:

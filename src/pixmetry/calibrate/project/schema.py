@@ -230,6 +230,7 @@ class OptionsModel(Model):
     residual_grid: bool | None = None
     a_priori: bool | None = None
     shared_errors: bool | None = None
+    patterns: bool | None = None
     max_iterations: Annotated[int, Field(ge=1)] | None = None
 
 

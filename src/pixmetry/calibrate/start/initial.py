@@ -31,6 +31,9 @@ from pixmetry.core.threads import single_threaded_blas
 TRIED_IMAGES = 12  # by which principal distances are compared
 FINE_STEPS = (1.25, 0.8, 1.0, 1.6, 0.63, 2.0, 0.5, 2.6, 0.4, 3.3, 4.2, 5.3, 6.6, 8.5)  # principal distances, in widths of the frame
 CONTROL_FITS = 0.3  # of FINE, as an rms: what a start from known points must reach
+AT_ONCE = 0.1  # the same, with which no other principal distance is tried
+SETTLED = 0.01  # change of the weights of a homography with which it stands
+POOR = 3.0  # median residual of an image, in spreads, at which its other answer is tried
 JOINS = 0.02  # rms distance at the points that join two parts, in units of the extent
 BEGINNINGS = (0, 1, 2, 4, 8, 14)  # pairs to begin with, one after the other while most images get no pose
 TIE = 3  # points that join two parts of a network
@@ -154,6 +157,9 @@ def _search_distance(work: Reconstruction, camera: int, images: np.ndarray) -> N
         else:
             trial.judge()
             cost = trial.cost(images)
+            if c == tries[0] and _settles_at_once(first := trial.copy(), images):
+                work.__dict__.update(first.__dict__)
+                return
             if cost < least:
                 best, least = trial, cost
     if best is None or not best.posed[images].any():
@@ -165,6 +171,21 @@ def _search_distance(work: Reconstruction, camera: int, images: np.ndarray) -> N
         best.judge()
         best.adjust(rounds=3)
     work.__dict__.update(best.__dict__)
+
+
+def _settles_at_once(trial: Reconstruction, images: np.ndarray) -> bool:
+    """Whether an adjustment makes the images fit so well that no other principal distance need be tried."""
+    if not trial.posed[images].all():
+        return False
+    trial.adjust(rounds=1)
+    trial.adjusted = int(trial.posed.sum())
+    poor = images[trial.typical_errors()[images] > POOR * trial.spread_px]  # a plane has two answers
+    for image in poor:
+        trial.resect(int(image))
+    if len(poor):
+        trial.judge()
+        trial.adjust(rounds=3)
+    return trial.fits(images, AT_ONCE)
 
 
 def _distance_from_planes(work: Reconstruction, camera: int, images: np.ndarray) -> float:
@@ -197,17 +218,24 @@ def homography(plane: Array, image: Array, passes: int = 6) -> Array:
         raise ValueError("a homography takes four points")
     (a, to_a), (b, to_b) = _normalised(plane), _normalised(image)
     weight = np.ones(len(a))
-    ones, zero = np.ones(len(a)), np.zeros((len(a), 3))
-    p = np.column_stack([a, ones])
-    for _ in range(passes):
-        rows = np.concatenate([np.hstack([p, zero, -b[:, :1] * p]), np.hstack([zero, p, -b[:, 1:] * p])])
-        h = np.linalg.svd(rows * np.tile(weight, 2)[:, None])[2][-1].reshape(3, 3)
+    p, x, y = np.column_stack([a, np.ones(len(a))]), b[:, 0], b[:, 1]
+    factors, normal = np.stack([np.ones_like(x), -x, -y, x**2 + y**2]), np.zeros((9, 9))
+    products = (p[:, :, None] * p[:, None, :]).reshape(len(p), 9)
+    for _ in range(passes):  # rows (p, 0, −x p) and (0, p, −y p), times the weight
+        one, by_x, by_y, by_both = ((factors * weight**2) @ products).reshape(4, 3, 3)
+        normal[:3, :3] = normal[3:6, 3:6] = one
+        normal[:3, 6:] = normal[6:, :3] = by_x
+        normal[3:6, 6:] = normal[6:, 3:6] = by_y
+        normal[6:, 6:] = by_both
+        before, h = weight, np.linalg.eigh(normal)[1][:, 0].reshape(3, 3)
         with np.errstate(all="ignore"):
             seen = p @ h.T
-            error = np.linalg.norm(seen[:, :2] / seen[:, 2:] - b, axis=1)
-            spread = max(3.0 * float(np.nanmedian(error)), 1e-9)
+            error = np.hypot(*(seen[:, :2] / seen[:, 2:] - b).T)
+            spread = max(3.0 * float(np.median(np.where(np.isnan(error), np.inf, error))), 1e-9)
             depth = np.abs(seen[:, 2]) / np.median(np.abs(seen[:, 2]))  # algebraic errors are geometric ones times the depth
             weight = np.nan_to_num(1 / (depth * np.sqrt(1 + (error / spread) ** 2)))
+        if (np.abs(weight - before) <= SETTLED * before).all():
+            break
     h = np.linalg.inv(to_b) @ h @ to_a
     of_unit_length: Array = h / np.linalg.norm(h)
     return of_unit_length
@@ -348,9 +376,15 @@ def _check_posed(work: Reconstruction) -> None:
 
 
 def _not_oriented(network: Network, posed: np.ndarray) -> MeasureError:
+    measured = np.isin(np.arange(len(posed)), network.image)
+    if measured.sum() == 1:
+        name = network.images[int(np.argmax(measured))]
+        remedy = "check the points' coordinates, the size of the frame and the lens: distortion that is held at 0 is a frequent reason"
+        return MeasureError(
+            "the only image fits no pose with the camera and the points as given", where="start values", value=name, remedy=remedy
+        )
     common = common_points(network)
     np.fill_diagonal(common, 0)
-    measured = np.isin(np.arange(len(posed)), network.image)
     left = np.flatnonzero(~posed & measured)
     best = common[left].max(axis=1)
     worst = left[np.argsort(best, kind="stable")][:5]

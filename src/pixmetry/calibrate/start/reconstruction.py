@@ -22,6 +22,7 @@ BY_IMAGES = (  # what may be free with so many images and image points of them
 )  # fmt: skip
 BY_KNOWN = ((1, 16, ("c",)), (1, 40, ("c", "k1")), (2, 100, CENTRED), (5, 240, TEN))  # the same with known points
 MANY_IMAGES = 24  # that determine the interior parameters well enough to go on with
+NEARLY_ALL = 1.1  # times the images of the last adjustment that may have a pose without another one
 MOST, QUANTILE = 0.93, 1.81  # share of the residuals that are taken for right, and the normal distribution's quantile of it
 PULLING = 0.001  # of the frame's width: largest scale of residuals that comes from those beyond the median
 OUTSTANDING = 8.0  # median residual of an image, in spreads, at which its pose is doubted
@@ -254,7 +255,7 @@ class Reconstruction:
                     failed = set()
                 else:
                     break
-        if self.adjusted < self.posed.sum():
+        if self.adjusted * NEARLY_ALL < self.posed.sum():
             self._adjust_and_judge()
 
     def mend(self) -> None:
@@ -263,7 +264,7 @@ class Reconstruction:
             known = self.posed[self.network.image] & np.isfinite(self.uv[:, 0])
             number = np.bincount(self.network.image[known], minlength=len(self.posed))
             fitting = np.bincount(self.network.image[known & self.good], minlength=len(self.posed))
-            poor = self.posed & ((fitting < RIGHT_SHARE * number) | (self._typical_errors() > OUTSTANDING * self.spread_px))
+            poor = self.posed & ((fitting < RIGHT_SHARE * number) | (self.typical_errors() > OUTSTANDING * self.spread_px))
             if not poor.any() or poor.sum() > 0.5 * self.posed.sum():
                 return
             self.rotation[poor], self.position[poor] = np.nan, np.nan
@@ -273,7 +274,7 @@ class Reconstruction:
             self.judge()
             self.grow()
 
-    def _typical_errors(self) -> np.ndarray:
+    def typical_errors(self) -> np.ndarray:
         """Median residual of each image, px."""
         error = np.hypot(*self.residuals().T)
         inside = [error[rows][np.isfinite(error[rows])] for rows in self.rows]

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pixmetry.calibrate.start import _pose_kernels as kernels
 from pixmetry.core.arrays import Array
 from pixmetry.core.extras import import_extra
 
@@ -50,8 +51,6 @@ def pose(uv: np.ndarray, xyz: np.ndarray, tolerance: float) -> Pose | None:
     tolerance : float
         Error of a direction, beyond which a point counts as wrong.
     """
-    cv2 = import_extra("cv2")
-
     good = np.isfinite(uv).all(axis=1) & np.isfinite(xyz).all(axis=1)
     if good.sum() < FEWEST:
         return None
@@ -61,27 +60,10 @@ def pose(uv: np.ndarray, xyz: np.ndarray, tolerance: float) -> Pose | None:
     flat, line = thickness(there)
     if line < 1e-3:
         return None
-    inside, candidates = np.ones(len(seen), bool), []
-    eye = np.eye(3)
-    try:
-        found, turn, shift, chosen = cv2.solvePnPRansac(
-            there, seen, eye, None, iterationsCount=300, reprojectionError=tolerance, confidence=0.9999, flags=cv2.SOLVEPNP_AP3P
-        )
-        if found and chosen is not None and len(chosen) >= FEWEST:
-            candidates.append((turn, shift))
-            inside[:] = False
-            inside[chosen.ravel()] = True
-        solvers = [cv2.SOLVEPNP_SQPNP] + ([cv2.SOLVEPNP_IPPE] if flat < FLAT else [])
-        for solver in solvers:
-            _, turns, shifts, _ = cv2.solvePnPGeneric(there[inside], seen[inside], eye, None, flags=solver)
-            candidates += list(zip(turns, shifts, strict=True))
-    except cv2.error:
-        pass  # a degenerate sample; the other solvers' answers stand
-    best = None
-    for turn, shift in candidates:
-        answer = _refined(there, seen, turn, shift, tolerance)
-        if answer is not None and (best is None or answer.cost < best.cost):
-            best = answer
+    best = _best_of(there, seen, _answers(there, seen, flat), tolerance)
+    if best is None or not best.fits.all():  # wrong points among them, or none that all agree with
+        other = _best_of(there, seen, _consenting(there, seen, flat, tolerance), tolerance)
+        best = other if best is None or (other is not None and other.cost < best.cost) else best
     if best is None or best.fits.sum() < max(FEWEST, RIGHT_SHARE * len(seen)):
         return None
     fits = np.zeros(len(uv), bool)
@@ -89,36 +71,50 @@ def pose(uv: np.ndarray, xyz: np.ndarray, tolerance: float) -> Pose | None:
     return Pose(best.rotation, middle + size * best.position, fits, best.cost)
 
 
-def _refined(xyz: np.ndarray, uv: np.ndarray, turn: np.ndarray, shift: np.ndarray, tolerance: float) -> Pose | None:
+def _answers(xyz: np.ndarray, uv: np.ndarray, flat: float) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Rotation vectors and shifts by all points."""
     cv2 = import_extra("cv2")
 
-    answer = _judged(xyz, uv, turn, shift, tolerance)
-    for _ in range(3):
-        if answer is None or answer.fits.sum() < FEWEST:
-            return answer
-        turn, shift = turn.copy(), shift.copy()
+    found: list[tuple[np.ndarray, np.ndarray]] = []
+    for solver in [cv2.SOLVEPNP_SQPNP] + ([cv2.SOLVEPNP_IPPE] if flat < FLAT else []):
         try:
-            cv2.solvePnPRefineLM(xyz[answer.fits], uv[answer.fits], np.eye(3), None, turn, shift)
+            _, turns, shifts, _ = cv2.solvePnPGeneric(xyz, uv, np.eye(3), None, flags=solver)
+            found += list(zip(turns, shifts, strict=True))
         except cv2.error:
-            return answer
-        new = _judged(xyz, uv, turn, shift, tolerance)
-        if new is None or not new.cost < 0.999 * answer.cost:
-            return answer if new is None or new.cost > answer.cost else new
-        answer = new
-    return answer
+            pass  # a degenerate sample; the other solvers' answers stand
+    return found
 
 
-def _judged(xyz: np.ndarray, uv: np.ndarray, turn: np.ndarray, shift: np.ndarray, tolerance: float) -> Pose | None:
+def _consenting(xyz: np.ndarray, uv: np.ndarray, flat: float, tolerance: float) -> list[tuple[np.ndarray, np.ndarray]]:
+    """The same by the points that agree with each other."""
     cv2 = import_extra("cv2")
 
-    if not (np.isfinite(turn).all() and np.isfinite(shift).all()):
-        return None
-    rotation = cv2.Rodrigues(turn)[0]
-    camera = xyz @ rotation.T + shift.ravel()
-    with np.errstate(all="ignore"):
-        error2 = np.sum((camera[:, :2] / camera[:, 2:] - uv) ** 2, axis=1)
-    error2 = np.where((camera[:, 2] > 0) & np.isfinite(error2), np.minimum(error2, tolerance**2), tolerance**2)
-    return Pose(rotation, -rotation.T @ shift.ravel(), error2 < tolerance**2, float(error2.mean()))
+    try:
+        found, turn, shift, chosen = cv2.solvePnPRansac(
+            xyz, uv, np.eye(3), None, iterationsCount=300, reprojectionError=tolerance, confidence=0.9999, flags=cv2.SOLVEPNP_AP3P
+        )
+    except cv2.error:
+        return []
+    if not found or chosen is None or len(chosen) < FEWEST:
+        return []
+    inside = np.zeros(len(uv), bool)
+    inside[chosen.ravel()] = True
+    return [(turn, shift), *_answers(xyz[inside], uv[inside], flat)]
+
+
+def _best_of(xyz: np.ndarray, uv: np.ndarray, candidates: list[tuple[np.ndarray, np.ndarray]], tolerance: float) -> Pose | None:
+    """The candidate that fits best when it is refined."""
+    from scipy.spatial.transform import Rotation
+
+    best = None
+    for turn, shift in candidates:
+        if not (np.isfinite(turn).all() and np.isfinite(shift).all()):
+            continue
+        rotation, moved, fits = Rotation.from_rotvec(turn.ravel()).as_matrix(), shift.ravel().copy(), np.zeros(len(uv), bool)
+        cost = kernels.refined(xyz, uv, rotation, moved, tolerance, FEWEST, fits)
+        if best is None or cost < best.cost:
+            best = Pose(rotation, -rotation.T @ moved, fits, cost)
+    return best
 
 
 def rays(uv: np.ndarray, rotation: np.ndarray) -> Array:
