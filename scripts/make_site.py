@@ -5,12 +5,14 @@ python scripts/make_site.py [FOLDER]        # default: site; open its index.html
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 import sys
 import tempfile
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import matplotlib as mpl
 
@@ -19,6 +21,10 @@ import pixmetry
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "docs"))  # the site's pages are no part of the package
 
+from gallery import questions  # noqa: E402
+from gallery.note import Note, stored_numbers  # noqa: E402
+from gallery.notebooks import notebook_of  # noqa: E402
+from gallery.pages import NOTES, ORDER  # noqa: E402
 from site_pages.api_pages import write_api_pages  # noqa: E402
 from site_pages.source_pages import write_source_pages  # noqa: E402
 
@@ -28,7 +34,7 @@ SECTIONS = {  # of the site, and the pages of each; a page that stands in none s
     "Getting started": ["start-folder-of-tiffs", "start-test-field", "start-data-sheet", "start-simulation"],
     "Measure a camera": ["frames", "planning", "emva1288", "compare", "series", "closed-loop"],
     "Measure with a camera": ["locating", "calibrating", "correct", "bound"],
-    "Budget and simulate": ["budget", "data-sheets", "cameras", "scenes", "simulate"],
+    "Budget and simulate": ["budget", "bench", "data-sheets", "cameras", "scenes", "simulate"],
     "Handbook": ["handbook/index"],
     "Reference": ["sources/index", "api/index", "glossary", "conventions"],
     "Develop": ["architecture", "adding-a-source", "decisions", "contributing", "changes"],
@@ -47,8 +53,11 @@ CONF: dict[str, Any] = {
         "secondary_sidebar_items": ["page-toc"],
     },
     "html_show_sourcelink": False,
+    "html_show_search_summary": False,  # a page opened from a folder may not read the others
     "html_copy_source": False,
+    "html_context": {"default_mode": "auto"},
     "myst_heading_anchors": 4,
+    "myst_enable_extensions": ["html_image"],  # the pages of the handbook have <img> with a width
     "add_module_names": False,
     "autodoc_typehints": "none",
     "numpydoc_show_class_members": False,
@@ -68,8 +77,9 @@ def stage(folder: Path) -> None:
     decisions = sorted(p.stem for p in (folder / "adr").glob("*.md"))
     (folder / "decisions.md").write_text("# Decisions\n\n" + _toctree(f"adr/{name}" for name in decisions), encoding="utf-8")
     handbook = folder / "handbook" / "index.md"
-    pages = sorted(p.stem for p in handbook.parent.glob("*.md") if p != handbook)
+    pages = [*ORDER, questions.NAME]
     handbook.write_text(handbook.read_text(encoding="utf-8") + "\n" + _toctree(pages, ":hidden:"), encoding="utf-8")
+    write_notebooks(folder / "handbook")
     for name in write_source_pages(folder / "sources"):
         print("source", name)
     write_api_pages(folder / "api", pixmetry)
@@ -81,6 +91,18 @@ def stage(folder: Path) -> None:
         if len(pages) > 1:
             (folder / f"{_name(title)}.md").write_text(f"# {title}\n\n{_toctree(pages, ':maxdepth: 1')}", encoding="utf-8")
     (folder / "index.md").write_text(_front(), encoding="utf-8")
+
+
+def write_notebooks(folder: Path) -> None:
+    """Write a notebook beside each page of the handbook that has a script, and name it on the page."""
+    numbers = stored_numbers()
+    for name in NOTES:
+        note = Note.read(name)
+        pictures = [(folder / f"{figure}.svg").read_text(encoding="utf-8") for figure in note.figures]
+        (folder / f"{name}.ipynb").write_text(json.dumps(notebook_of(note, numbers[name], pictures), indent=1, ensure_ascii=False) + "\n")
+        page = folder / f"{name}.md"
+        words = f"## The script\n\nDownload it with its results: {{download}}`{name}.ipynb`\n"
+        page.write_text(page.read_text(encoding="utf-8").replace("## The script\n", words, 1), encoding="utf-8")
 
 
 def _linked(page: Path, folder: Path) -> str:
@@ -128,8 +150,20 @@ def _name(section: str) -> str:
     return pages[0] if len(pages) == 1 else section.lower().replace(" ", "-")
 
 
+def missing_files(site: Path) -> list[str]:
+    """Pictures, links, styles and scripts that a page of a built site names and that are not there."""
+    named = re.compile(r'\b(?:src|href)="([^"#?]+)')
+    wrong = []
+    for page in sorted(p for p in site.rglob("*.html") if "_static" not in p.parts):
+        for target in set(named.findall(page.read_text(encoding="utf-8"))):
+            if not re.match(r"[a-z]+:|//", target) and not (page.parent / unquote(target)).exists():
+                wrong.append(f"{page.relative_to(site)}: {target}")
+    return wrong
+
+
 def main() -> None:
     """Stage the pages in a temporary folder and build them; a warning is an error."""
+    import nbformat
     from sphinx.application import Sphinx
 
     out = Path(sys.argv[1] if len(sys.argv) > 1 else "site").resolve()
@@ -138,10 +172,14 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         source = Path(temporary) / "pages"
         stage(source)
+        for notebook in source.rglob("*.ipynb"):
+            nbformat.validate(nbformat.read(notebook, as_version=4))
         app = Sphinx(source, None, out, Path(temporary) / "trees", "html", confoverrides=CONF, warningiserror="--draft" not in sys.argv)
         app.build()
         if app.statuscode:
             raise SystemExit(app.statuscode)
+    if wrong := missing_files(out):
+        raise SystemExit("not in the site: " + "; ".join(wrong))
     print(f"site: {out / 'index.html'}")
 
 

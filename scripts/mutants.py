@@ -404,6 +404,75 @@ FAULTS = (
         "else sigma * u,",
         "tests/calibrate/test_variance_components.py",
     ),
+    # boards, exchange, shared errors
+    Fault(
+        "a rim of a chessboard that is the outline of its squares",
+        "crossing: np.ndarray = gap > CLEAR_COLOUR * contrast",
+        "crossing: np.ndarray = gap > -np.inf * contrast",
+        "tests/locate/test_corners.py -k outline",
+    ),
+    Fault(
+        "segments of a printed ring the other way round",
+        "bit * step, (bit + 1) * step)",
+        "-(bit + 1) * step, -bit * step)",
+        "tests/calibrate/test_boards.py -k rings",
+    ),
+    Fault(
+        "rings of another number of segments",
+        "*ellipses, bits=task.segments, threads",
+        "*ellipses, bits=12, threads",
+        "tests/calibrate/test_boards.py -k rings",
+    ),
+    Fault(
+        "half a step of an asymmetric plate",
+        "(c + 0.5 * (r % 2)) * pitch",
+        "(c + 0.5 * ((r + 1) % 2)) * pitch",
+        "tests/calibrate/test_boards.py -k asymmetric",
+    ),
+    Fault(
+        "decentring of HALCON per m²",
+        '"p1": 1e-3, "p2": 1e-3, "d1"',
+        '"p1": 1e-6, "p2": 1e-6, "d1"',
+        "tests/calibrate/test_photogrammetric.py",
+    ),
+    Fault(
+        "half a pixel of PhotoModeler's corner",
+        '"xp": (form["xp"] + 0.5) * mx',
+        '"xp": form["xp"] * mx',
+        "tests/calibrate/test_photogrammetric.py",
+    ),
+    Fault(
+        "y of Australis downwards",
+        '"yp": (y0 - form["yp"]) * my',
+        '"yp": (form["yp"] - y0) * my',
+        "tests/calibrate/test_photogrammetric.py",
+    ),
+    Fault(
+        "affinity in the pitch the other way round",
+        'factor = 1 + b1 if model.direction == "image_to_object" else 1 / (1 + b1)',
+        'factor = 1 / (1 + b1) if model.direction == "image_to_object" else 1 + b1',
+        "tests/calibrate/test_photogrammetric.py",
+    ),
+    Fault(
+        "covariance of another form by the model's own slopes",
+        "return Known(tuple(NAMES[k] for k in kept), by @ known.covariance @ by.T)",
+        "return Known(tuple(NAMES[k] for k in kept), 1.2 * by @ known.covariance @ by.T)",
+        "tests/calibrate/test_photogrammetric.py",
+    ),
+    Fault(
+        "focal length of OpenCV without the affinity",
+        '"c": (0, (1 + b1) / mx)',
+        '"c": (0, 1.01 / mx)',
+        "tests/calibrate/test_photogrammetric.py",
+    ),
+    Fault("COLMAP's half pixel", "cx + 0.5, cy + 0.5", "cx, cy", "tests/calibrate/test_exchange.py"),
+    Fault("metres of Kalibr's chain", '"mm": 1e-3, "cm"', '"mm": 1e-2, "cm"', "tests/calibrate/test_calibration_exports.py -k kalibr"),
+    Fault(
+        "degrees of freedom of shared errors twice",
+        "dof = 2 * variance**2 / np.einsum(",
+        "dof = 4 * variance**2 / np.einsum(",
+        "tests/calibrate/test_shared_errors.py",
+    ),
     # the budget
     Fault("variance of a limit", "covariance[i, i] = e.value**2 / 12", "covariance[i, i] = e.value**2 / 6", "tests/budget"),
     Fault(

@@ -7,6 +7,9 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+from gallery.note import Note, stored_numbers
+from gallery.notebooks import notebook_of
+from gallery.pages import NOTES
 from site_pages import source_pages
 
 import pixmetry
@@ -32,8 +35,32 @@ def test_all_pages_are_there_and_linked(maker: ModuleType, tmp_path: Path, monke
     assert {p.stem for p in (pages / "sources").glob("*.md")} == {"index", *sources()}
     shown = {p.stem.rpartition("-")[0] for p in (pages / "api").glob("*.rst")}
     assert shown == {name.lower() for name in pixmetry.__all__ if not name.startswith("_")}
+    assert {p.stem for p in (pages / "handbook").glob("*.ipynb")} == set(NOTES)
     wrong = {p.name: links for p in pages.rglob("*.md") if (links := broken(p, p.read_text(encoding="utf-8")))}
     assert not wrong
+
+
+def test_a_notebook_has_the_script_of_its_page_and_prints_what_it_holds(capsys: pytest.CaptureFixture[str]) -> None:
+    numbers, names = stored_numbers(), {}
+    for name in NOTES:
+        note = Note.read(name)
+        made = notebook_of(note, numbers[name], ["<svg/>"] * len(note.figures))
+        code = {cell["id"]: "".join(cell["source"]) for cell in made["cells"] if cell["cell_type"] == "code"}
+        assert code["numbers"] + "\n\n\n" + code["functions"] == note.script.partition('"""\n\n')[2].strip()
+        assert len(made["cells"][-1]["outputs"]) == len(note.figures)
+        assert len({cell["id"] for cell in made["cells"]}) == len(made["cells"])
+        if name == "interline":  # a quick one
+            for part in ("numbers", "functions", "run"):
+                exec(compile(code[part], name, "exec"), names)
+            assert capsys.readouterr().out == "".join(made["cells"][3]["outputs"][0]["text"])
+
+
+def test_a_picture_that_a_page_names_must_be_in_the_site(maker: ModuleType, tmp_path: Path) -> None:
+    (tmp_path / "a b.svg").write_text("<svg/>")
+    (tmp_path / "a.html").write_text('<img src="a%20b.svg"><a href="a.html#x">here</a><a href="https://example.org/b.html">there</a>')
+    assert maker.missing_files(tmp_path) == []
+    (tmp_path / "a.html").write_text('<img src="figure.svg">')
+    assert maker.missing_files(tmp_path) == ["a.html: figure.svg"]
 
 
 def test_a_page_without_a_section_stops_the_build(maker: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

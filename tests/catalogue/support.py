@@ -239,3 +239,9 @@ def truth_maps(source: Source, params: Any, shape: tuple[int, int], seed: int = 
     spread = 1.4826 * np.median(np.abs(dark - np.median(dark))) + 1e-9
     defects = (np.abs(dark - np.median(dark)) > 8 * spread) | (np.abs(response - np.median(response)) > 0.2)
     return {"dark_dn": dark, "prnu_rel": response / response.mean(), "defects": defects}
+
+
+def frame_maps(with_it: np.ndarray, without: np.ndarray) -> Mapping[str, np.ndarray]:
+    """What an ideal look at these very frames would know of them, shape (n, rows, cols) both: offsets of rows and columns, factors."""
+    added, factor = with_it.astype(float) - without, with_it.astype(float) / np.maximum(without, 1e-9)
+    return {"row_offset_dn": added.mean(axis=2), "column_offset_dn": added.mean(axis=1), "factor_rel": factor.mean(axis=2)}

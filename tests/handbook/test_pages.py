@@ -9,7 +9,10 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import pytest
-from gallery.item import Item
+from gallery import questions
+from gallery.chapter import ENTRIES, entry_of
+from gallery.chapter import NOTES as CHAPTER_NOTES
+from gallery.item import KINDS, REASONS, Item
 from gallery.note import MOST_LINES, STORED, Note
 from gallery.page import Page, table
 from gallery.pages import NOTES, ORDER, Gallery, make_gallery
@@ -46,7 +49,7 @@ def pages(gallery: Gallery) -> dict[str, Page]:
     return gallery.pages
 
 
-@pytest.mark.parametrize("name", ["index", *ORDER])
+@pytest.mark.parametrize("name", ["index", questions.NAME, *ORDER])
 def test_the_page_is_what_the_script_writes(name: str, pages: dict[str, Page]) -> None:
     wrong = differences((FOLDER / f"{name}.md").read_text(encoding="utf-8"), pages[name].text)
     assert not wrong, f"run make handbook: {wrong[:5]}"
@@ -62,12 +65,46 @@ def test_the_record_of_all_items_is_what_the_scripts_write(gallery: Gallery) -> 
     assert len({item["id"] for item in record["items"]}) == len(record["items"]) == len(gallery.items)
 
 
+def test_every_figure_table_number_and_note_of_the_chapter_is_there(gallery: Gallery) -> None:
+    """24 figures, 3 tables, 26 numbers and 22 notes: each has an item or a page, and no item is of nothing that the chapter has."""
+    figures, tables = [f"Fig 3.{k}" for k in range(1, 25)], ["T3.1", "T3.1 errors", "T3.2"]
+    assert list(ENTRIES) == [*figures, *tables, *(f"N{k}" for k in range(1, 27))]
+    found = {entry_of(item.id) for item in gallery.items}
+    assert set(ENTRIES) <= found
+    assert found - set(ENTRIES) <= {f"Note {k}" for k in range(1, 23)}
+    assert len(CHAPTER_NOTES) == 22 and set(CHAPTER_NOTES) <= set(ORDER)
+    text = gallery.pages["index"].text.partition("Each is on a page")[2].partition("## ")[0]
+    listed = re.findall(r"^\| ((?:Fig|T|N)[\w. ]+) \|", text, re.M)
+    assert listed == list(ENTRIES)
+
+
+def test_every_verdict_is_one_of_three_and_says_why(gallery: Gallery) -> None:
+    for item in gallery.items:
+        assert item.kind in KINDS
+        inside = abs(item.ours - item.expected) <= item.tolerance
+        assert (item.verdict == "agree") == inside, item.id
+        if not inside:
+            assert item.why and (item.verdict == "chapter inconsistent" or item.verdict.startswith(REASONS[1])), item.id
+            assert len(re.findall(r"\d", item.why)) or item.kind in "SVD", (
+                f"{item.id}: the reason of an arithmetic item has its computation"
+            )
+
+
 @pytest.mark.parametrize("name", NOTES)
 def test_a_script_is_short_and_takes_only_what_a_user_has(name: str) -> None:
     script = Note.read(name).script
     assert len(script.splitlines()) <= MOST_LINES
     imported = set(re.findall(r"^\s*(?:from|import) (\w+)", script, flags=re.M))
     assert imported <= {"numpy", "pixmetry", "matplotlib", *sys.stdlib_module_names} and not re.search(r"pixmetry[\w.]*\._", script)
+
+
+def test_one_number_changed_in_a_script_gives_the_answer_that_the_page_tells() -> None:
+    told = json.loads(STORED.read_text(encoding="utf-8"))["numbers"]
+    assert len(questions.QUESTIONS) >= 5
+    for k, question in enumerate(questions.QUESTIONS):
+        for name, value in question.run().items():
+            assert value == pytest.approx(told[questions.NAME][f"{k}_{name}"], rel=0.01), question.ask
+        assert any(told[questions.NAME][f"{k}_{name}"] != told[question.page][name] for name in question.shown), question.ask
 
 
 def test_there_are_no_other_files(pages: dict[str, Page]) -> None:

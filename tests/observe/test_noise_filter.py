@@ -182,3 +182,14 @@ def test_u_of_a_contrast_grows_with_it_when_a_filter_is_undone():
     spatial = Estimates.from_rows([("prnu_pixel_rel", 0.01, 0.0, np.inf, "1")])
     before = before_correlation(spatial, NoiseFilter(kind="linear", factor=4.0, u_factor=0.4), 100.0)["prnu_pixel_rel"]
     assert before.value == pytest.approx(0.02) and before.u == pytest.approx(0.02 * 0.05)
+
+
+def test_the_pattern_behind_an_unknown_filter_is_not_told():
+    """That of a demosaicking is: its original pixels are as the converter gave them. Rows keep theirs."""
+    rows = [(name, 0.01, 1e-4, np.inf, "1") for name in ("prnu_pixel_rel", "prnu_col_rel", "prnu_row_rel", "dsnu_pixel_dn")]
+    spatial = Estimates.from_rows(rows, method="as drawn")
+    found = before_correlation(spatial, NoiseFilter(kind="unknown", name="no linear filter fits", factor=1.3, u_factor=0.3), 100.0)
+    assert found.names == ("prnu_row_rel",)
+    assert all("no linear filter fits" in found.reasons[name] for name in ("prnu_pixel_rel", "prnu_col_rel", "dsnu_pixel_dn"))
+    kept = before_correlation(spatial, NoiseFilter(kind="unknown", name="demosaicking, bilinear, stored colour green"), 100.0)
+    assert kept.names == spatial.names

@@ -72,6 +72,16 @@ def test_recovers_the_exponent_and_the_gain_of_a_power_curve_from_a_scene(gamma:
     assert estimates["electronics.gain"]["gain_dn_per_e"].value == fit["gain_dn_per_e"].value
 
 
+def test_light_as_weak_as_its_noise_does_not_pull_the_exponent(rng: np.random.Generator):
+    """Patches of 15 electrons with 9 of noise, whose mean behind a steep curve no second order tells. Mean z of four scenes, 1e-6."""
+    z = []
+    for _ in range(4):
+        response = observed(*scene(rng, power(0.45), frames=24, black=300.0, u_rel=2e-4)).response
+        assert response is not None and response.curve == "power" and response.fit["gamma"].u < 5e-4
+        z.append((response.fit["gamma"].value - 0.45) / response.fit["gamma"].u)
+    assert abs(np.mean(z)) < 4.9 / np.sqrt(4)
+
+
 def test_published_curve_of_bt709_is_found_with_its_reference(rng: np.random.Generator):
     """ITU-R BT.709-6 prints 1.099 and 4.5 for 1.09914 and 4.507: its reference and exponent are met to 1 %."""
     response = observed(*scene(rng, bt709())).response

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from pixmetry.camera.observations import StackMoments
+from pixmetry.camera.observations import StackMoments, TapSteps
+from pixmetry.core.number import Estimates
 from pixmetry.observe.spatial_fit import fit_spatial
 from pixmetry.observe.stack import StackAccumulator
 from pixmetry.observe.tap_steps import evened, find_taps, with_steps_in_slope
@@ -62,3 +63,17 @@ def test_a_sensor_without_taps_is_left_as_it_is(rng: np.random.Generator):
     if found.fit.limits == {"step_rel", "odd_even_rel"}:
         assert evened(dark, bright, found) is bright
     assert np.abs(found.gain - 1).max() < 0.003
+
+
+def test_a_step_that_was_not_found_is_in_u_of_the_slope_and_of_the_columns():
+    """Of a step that a polynomial of fourth order is fitted to, the slope in the middle is in the light's, the rest in the columns'."""
+    step, columns, cols = 5e-4, 1e-3, SHAPE[1]
+    x = (np.arange(cols) - 99.5) / 99.5
+    side = np.where(x < 0, -0.5, 0.5)
+    fitted = np.polynomial.Polynomial.fit(x, side, 4, domain=(-1, 1))
+    rows = [("shading_x_per_px", SLOPE, 3e-7, np.inf, "1/px"), ("prnu_col_rel", columns, 2e-5, np.inf, "1")]
+    found = with_steps_in_slope(Estimates.from_rows(rows, method="as drawn"), TapSteps(Estimates.empty(), np.ones(cols), step))
+    assert found["shading_x_per_px"].u == pytest.approx(np.hypot(3e-7, step * fitted.deriv()(0.0) / 99.5))
+    assert found["shading_x_per_px"].u > 4e-6
+    raised = step**2 * np.mean((side - fitted(x)) ** 2) / (2 * columns)
+    assert found["prnu_col_rel"].u == pytest.approx(np.hypot(2e-5, raised), rel=1e-9)

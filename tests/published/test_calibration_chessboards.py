@@ -142,7 +142,7 @@ def test_halves_of_the_pictures_agree_within_the_stated_uncertainties() -> None:
     """Every other picture, and the first half against the second: with uncertainties of independent errors F is 4.0 and 6.7 (p < 1e-4)."""
     tests = calibrated().tests
     (shared,), (halves,) = tests.shared_errors.values(), tests.halves.values()
-    assert shared.found and set(shared.kinds) == {"image", "frame", "view"}
+    assert shared.found and set(shared.kinds) == {"image", "frame", "view", "oblique"}
     for one in halves:
         assert one.p > 0.05 and one.f < 2, (one.by, one.f)
 

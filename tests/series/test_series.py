@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from pathlib import Path
 
 import numpy as np
@@ -204,3 +205,17 @@ def test_frames_of_a_film_may_be_jpeg(rng: np.random.Generator, tmp_path: Path) 
     assert any("kind series are JPEG" in note for note in found.observations.notes)
     assert "storage.jpeg" not in found.estimates  # how a film was stored is not how the camera stores
     assert "sensor.mount_drift" in found.estimates or "series" in found.unmeasured["sensor.mount_drift"]
+
+
+def test_the_live_view_tells_how_far_and_how_long(rng: np.random.Generator) -> None:
+    """A camera that settles with 900 s, seen for half an hour: its corners stay within 0.05 px from 900 ln(0.472/0.05) s on."""
+    from pixmetry.series.page import outlook_sentence
+
+    times = np.arange(60) * 31.0
+    frames = [rendered(PLACES + SHIFT * (1 - np.exp(-t / 900.0)), SHAPE, rng) for t in times]
+    told = outlook_sentence(measure_series([(str(k), t, lambda k=k: frames[k]) for k, t in enumerate(times)]).drift)
+    found = re.fullmatch(r"([\d.]+) ± ([\d.]+) px to go; stable \(within 0.05 px\) in ([\d.]+) ± ([\d.]+) min", told)
+    assert found is not None, told
+    far, u_far, minutes, u_minutes = (float(v) for v in found.groups())
+    assert abs(far - np.hypot(*SHIFT) * np.exp(-times[-1] / 900)) < 6 * u_far
+    assert abs(minutes - (900 * np.log(np.hypot(*SHIFT) / 0.05) - times[-1]) / 60) < 6 * u_minutes

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from inspect import getdoc
@@ -18,32 +17,46 @@ from pixmetry.camera.line import Line
 from pixmetry.camera.overrides import changed_camera, with_source
 from pixmetry.camera.provenance import MEASURED, TYPICAL
 from pixmetry.camera.signal import Kind, Signal
-from pixmetry.core.checksums import check_file, check_record
-from pixmetry.core.errors import InputError, ParameterError
+from pixmetry.core.errors import InputError, MeasureError, ParameterError
 from pixmetry.core.progress import Progress, no_progress
 from pixmetry.core.random import Grid, Streams
 from pixmetry.core.threads import imap_tiles
-from pixmetry.files import InputHashes, provenance_record, read_maps, staged_output, write_json
+from pixmetry.files import InputHashes, provenance_record, staged_output, write_json
+from pixmetry.files.assessment import load_assessment
 from pixmetry.files.formats import is_frame
 from pixmetry.files.images import LoadedFrame, check_frame, load_frame, picture_files
 from pixmetry.files.raw_values import RawLayout, layout_of
 from pixmetry.observe.covered import row_and_column_offsets
+from pixmetry.observe.sequence import LEAST_FRAMES, FrameFactors, FrameLight, factors_of_frames
 from pixmetry.observe.surface import fit_surface
 
-MAP_OF = {"sensor.dsnu": "dark_dn", "sensor.prnu": "prnu_rel", "sensor.defects": "defects"}  # maps in stored pixels and DN above black
+OF_UNIT = {"sensor.dsnu": "dark_dn", "sensor.prnu": "prnu_rel", "sensor.defects": "defects"}  # maps in stored pixels and DN above black
+OF_FRAMES = {  # told by the frames themselves, whatever a description says
+    "electronics.row_noise": "row_offset_dn",
+    "electronics.column_noise": "column_offset_dn",
+    "electronics.agc": "factor_rel",
+    "optics.flicker": "factor_rel",
+}
+MAP_OF = OF_UNIT | OF_FRAMES
+MEASURES_IT = "; an assessment of the camera measures it"
 SUPPLY = {
-    "dark_dn": "dark frames: give some (--dark, in Python dark=)",
-    "prnu_rel": "frames of an even field: give some (--flat, in Python flat=)",
-    "defects": "a mask of the defect pixels: give one (--defects, in Python defects=)",
+    "dark_dn": f"dark frames: give some (--dark, in Python dark=){MEASURES_IT}",
+    "prnu_rel": f"frames of an even field: give some (--flat, in Python flat=){MEASURES_IT}",
+    "defects": f"a mask of the defect pixels: give one (--defects, in Python defects=){MEASURES_IT}",
+    "row_offset_dn": "optically black columns beside the image (covered in the camera's facts), in frames stored with them",
+    "column_offset_dn": "optically black rows above or below the image (covered in the camera's facts), in frames stored with them",
+    "factor_rel": f"{LEAST_FRAMES} frames or more in a row (--sequence, in Python sequence=True), in parts of which nothing changes",
 }
 SURFACE_DEGREE, SMALLEST = 4, 12  # of the light of a flat field, and the rows and columns that it needs
 LEAST_RESPONSE = 0.1  # of a pixel that is divided by it; one with less is a defect
 MOST_CLIPPED = 0.01  # of the values of dark or flat frames: hot pixels
+RESCALES = ("electronics.agc", "processing.temporal_noise_reduction")  # what stored values tell of a frame is changed by these
 BY_VALUE = ("electronics.gamma", "electronics.hdr_gain", "electronics.nonlinearity")  # ask for no place
 HIDDEN_BY = {"sensor.bayer_mosaic": "processing.demosaic"}  # what is not there any more behind another source
-BY_BORDERS = {  # what covered pixels of the same frame tell, by the map of it
-    "electronics.row_noise": ("row_offset_dn", "each row by the covered columns beside it"),
-    "electronics.column_noise": ("column_offset_dn", "each column by the covered rows above and below it"),
+TOLD_BY = {
+    "row_offset_dn": "the covered pixels of each frame",
+    "column_offset_dn": "the covered pixels of each frame",
+    "factor_rel": "what stays as it is from frame to frame",
 }
 WHOLE_PX = 0.01  # by which a place on the pixel grid may be off
 
@@ -115,14 +128,12 @@ def correct_signal(
     """
     chosen = tuple(only), tuple(skip)
     steps: list[FrameCorrection] = []
-    for element in reversed(camera.active):
+    for element in _last_first(camera):
         if element.name == until:
             break
-        if element.source.id in BY_BORDERS and BY_BORDERS[element.source.id][0] in maps and _is_wanted(element, *chosen):
-            signal, step = _without_offsets(element, signal, maps)
-            steps.append(step)
-            continue
-        why_not = _reason(element, maps, *chosen)
+        of_factors = MAP_OF.get(element.source.id) == "factor_rel"
+        divided = [s.name for s in steps if s.corrected and MAP_OF.get(camera[s.name].source.id) == "factor_rel"]
+        why_not = _reason(element, maps, *chosen) or (f"nothing to correct: {divided[0]} has it" if of_factors and divided else "")
         if why_not:
             steps.append(FrameCorrection(element.name, element.source.title, False, why_not))
             continue
@@ -141,6 +152,14 @@ def correct_signal(
     return signal, tuple(steps)
 
 
+def _last_first(camera: Camera) -> list[Element]:
+    """The sources as they are undone. Offsets that are told in stored values go before what changes the scale of frames, or mixes them."""
+    order = list(reversed(camera.active))
+    first = next((i for i, e in enumerate(order) if e.source.id in RESCALES), len(order))
+    told = [e for e in order[first:] if OF_FRAMES.get(e.source.id, "factor_rel") != "factor_rel"]
+    return order[:first] + told + [e for e in order[first:] if all(e is not t for t in told)]
+
+
 def _reason(element: Element, maps: Mapping[str, np.ndarray], only: tuple[str, ...], skip: tuple[str, ...]) -> str:
     """Why a source is not corrected; empty where it is."""
     source, named = element.source, element.name in only
@@ -151,8 +170,10 @@ def _reason(element: Element, maps: Mapping[str, np.ndarray], only: tuple[str, .
         return ""  # what goes on is in DN
     if element.name in skip or (only and not named):
         return "not corrected: left out, as asked"
-    if needs is not None and needs not in maps:
-        return f"not corrected: needs {SUPPLY[needs]}; an assessment of the camera measures it"
+    if needs is not None and needs not in maps and not (needs == "factor_rel" and _is_idle(element)):
+        return f"not corrected: needs {SUPPLY[needs]}"
+    if source.id in OF_FRAMES:
+        return "nothing to correct" if _is_idle(element) else ""
     if source.stage == "optics" and element.known_from == MEASURED and not named:
         return "not corrected: these frames have another light and lens than the campaign"
     if element.known_from == TYPICAL and needs is None and not named:
@@ -160,19 +181,10 @@ def _reason(element: Element, maps: Mapping[str, np.ndarray], only: tuple[str, .
     return ""
 
 
-def _is_wanted(element: Element, only: tuple[str, ...], skip: tuple[str, ...]) -> bool:
-    """Whether a source is among those asked for."""
-    return element.name not in skip and (not only or element.name in only)
-
-
-def _without_offsets(element: Element, signal: Signal, maps: Mapping[str, np.ndarray]) -> tuple[Signal, FrameCorrection]:
-    """A signal without the offsets of its rows, or columns, that the covered pixels of the same frame tell."""
-    name, does = BY_BORDERS[element.source.id]
-    offset = maps[name].astype(np.float32)
-    data = signal.data - (offset[:, None] if name == "row_offset_dn" else offset)
-    leaves = "the noise of the covered pixels' mean, as far as the weight lets it through"
-    text = "corrected by the covered pixels of each frame"
-    return signal.with_data(data), FrameCorrection(element.name, element.source.title, True, text, does, leaves)
+def _is_idle(element: Element) -> bool:
+    """Whether a source does nothing with these parameters: it keeps no state, or they are the neutral ones."""
+    source = element.source
+    return bool(source.start(element.params) is None if source.start is not None else element.params == source.neutral)
 
 
 def _since(camera: Camera, element: Element) -> str:
@@ -191,6 +203,8 @@ def _told(element: Element, changed: bool, noise_rel: float, since: str) -> Fram
     if not changed:
         return FrameCorrection(element.name, source.title, False, "nothing to correct")
     text = "corrected by typical parameters" if element.known_from == TYPICAL and source.id not in MAP_OF else "corrected"
+    if source.id in OF_FRAMES:
+        text += f" by {TOLD_BY[OF_FRAMES[source.id]]}"
     if since and source.id not in MAP_OF:
         text += f", as far as it is not changed since by {since}"
     does = (getdoc(source.correct) or "").partition("\n")[0]
@@ -245,7 +259,7 @@ def _noise_rel(undone: Any, signal: Signal, corrected: Signal) -> float:
     """What a correction makes of white noise of 1 DN: the standard deviation of the change that it brings, over the frame."""
     noise = Streams(0, 0).of("noise of a correction").normal(signal.grid)
     noisy = undone(signal.with_data((signal.data + noise).astype(np.float32)))
-    return float(np.std(noisy.data.astype(float) - corrected.data) / np.std(noise))
+    return float(np.std(noisy.data[-1].astype(float) - corrected.data[-1]) / np.std(noise))
 
 
 def _rest_of_line(camera: Camera, name: str, done: frozenset[str], signal: Signal) -> Line | None:
@@ -343,7 +357,9 @@ def correct(
         Of files without a header: ``"1920x1200:Mono12p"``.
     sequence : bool
         Whether the frames were taken one after the other without a pause, files in the order of their names. Then what a frame leaves in
-        the next one (``sensor.image_lag``) is corrected, from the second frame on.
+        the next one (``sensor.image_lag``, ``processing.temporal_noise_reduction``) is corrected, from the second frame on; and what makes
+        the frames, or their rows, unequally bright (``electronics.agc``, ``optics.flicker``), by the parts of the scene that stay as they
+        are.
     progress : callable, optional
         Called with (what, done, of).
 
@@ -394,21 +410,47 @@ class Known:
     files: tuple[Path, ...] = ()
 
     def corrected(
-        self, frame: np.ndarray, weigh: bool = False, before: np.ndarray | None = None
+        self,
+        frame: np.ndarray,
+        weigh: bool = False,
+        before: Sequence[np.ndarray] = (),
+        factors: np.ndarray | None = None,
+        until: str | None = None,
     ) -> tuple[Signal, tuple[FrameCorrection, ...]]:
-        """A frame of codes without what is known; ``before``: the frame that was taken just before it."""
-        maps = dict(self.maps)
-        if self.covered is not None and frame.shape == self.covered.stored_shape(self.camera.output_shape):
-            sinks = any(e.source.id == "grabber.clamp" and e.params.droop_rel > 0 for e in self.camera.active)
-            maps |= row_and_column_offsets(frame, self.covered, left_alone=sinks)
-            frame = np.ascontiguousarray(frame[self.covered.active(frame.shape)])
-        if before is None or not any(e.source.start is not None and e.source.correct is not None for e in self.camera.active):
-            signal = _as_signal(frame, self.camera)
-            return correct_signal(self.camera, signal, maps, only=self.only, skip=self.skip, weigh=weigh)
-        stack = np.stack([self.lit(before[None])[0], frame])
-        both = _signal_of(stack, self.camera.output_shape, Kind.CODES, self.camera, first_frame=1)
-        signal, steps = correct_signal(self.camera, both, maps, only=self.only, skip=self.skip, weigh=weigh)
-        return signal.take(np.array([1])), steps
+        """A frame of codes without what is known.
+
+        ``before`` are the frames that were taken just before it, and ``factors``, shape (frames, rows), the factors of these and of it.
+        Sources are undone back to that named ``until``, which stays.
+        """
+        stack = np.stack([*before, frame])
+        maps = {**self.maps, **self._offsets(stack)}
+        if factors is not None:
+            maps["factor_rel"] = factors
+        first = 1 if before else None
+        signal = _signal_of(np.ascontiguousarray(self.lit(stack)), self.camera.output_shape, Kind.CODES, self.camera, first)
+        signal, steps = correct_signal(self.camera, signal, maps, only=self.only, skip=self.skip, until=until, weigh=weigh)
+        return (signal.take(np.array([len(stack) - 1])) if before else signal), steps
+
+    @property
+    def memory(self) -> int:
+        """How many frames before it a frame is corrected by, in a sequence."""
+        keeping = [e for e in self.camera.active if e.source.start is not None and e.source.correct is not None]
+        return sum(e.source.id not in OF_FRAMES and not _is_idle(e) for e in keeping)
+
+    def followed(self) -> str:
+        """Name of the source behind which the factors of a sequence's frames are told, the last of the chain; empty without one."""
+        moving = [e for e in self.camera.active if OF_FRAMES.get(e.source.id) == "factor_rel" and not _is_idle(e)]
+        wanted = [e.name for e in moving if not _reason(e, {"factor_rel": np.empty(0)}, self.only, self.skip)]
+        return wanted[-1] if wanted else ""
+
+    def _offsets(self, stack: np.ndarray) -> dict[str, np.ndarray]:
+        """Offsets of the rows and columns of frames that have their covered borders, shape (frames, rows) and (frames, cols)."""
+        covered = self.covered
+        if covered is None or stack.shape[1:] != covered.stored_shape(self.camera.output_shape):
+            return {}
+        sinks = any(e.source.id == "grabber.clamp" and e.params.droop_rel > 0 for e in self.camera.active)
+        found = [row_and_column_offsets(frame, covered, left_alone=sinks) for frame in stack]
+        return {name: np.array([f[name] for f in found]) for name in found[0]}
 
     @property
     def covered(self) -> Covered | None:
@@ -452,14 +494,14 @@ def known_of(
     if isinstance(with_, Camera):
         camera = with_
     elif Path(with_).is_dir() or Path(with_).suffix.lower() == ".json":
-        bits, camera, maps = _load(Path(with_))
+        bits, camera, maps = load_assessment(with_)
         files = (Path(with_),)
     else:
         camera = load_camera(with_)
         files = (Path(with_),) if Path(with_).is_file() else ()
     for source_id in (
         *(key.rpartition(".")[0] for key in settings or {}),
-        *(i for i, m in zip(MAP_OF, (dark, flat, defects), strict=True) if m is not None),
+        *(i for i, m in zip(OF_UNIT, (dark, flat, defects), strict=True) if m is not None),
     ):
         camera = _with(camera, source_id)
     camera = changed_camera(camera, settings)
@@ -505,7 +547,7 @@ def _own_maps(camera: Camera) -> dict[str, np.ndarray]:
     gain = next((e.params.gain_dn_per_e for e in camera.active if e.source.id == "electronics.gain"), None)
     told = camera.truth()
     for element in camera.active:
-        name = MAP_OF.get(element.source.id)
+        name = OF_UNIT.get(element.source.id)
         if name is None or not element.maps:
             continue
         own = told[element.name]
@@ -609,15 +651,21 @@ def _correct_array(frames: np.ndarray, known: Known, sequence: bool = False) -> 
         raise InputError("values that this camera cannot store", where="frames", value=int(stack.max()), allowed=f"0 to {top}")
     stack = stack.astype(np.uint8 if known.bits <= 8 else np.uint16)
     said: list[tuple[FrameCorrection, ...]] = []
-    shown = 1 if sequence and len(stack) > 1 else 0  # the frame of which the steps are told
-    active = known.lit(stack)
-    out = np.empty(active.shape, np.float32)
     for i, frame in enumerate(stack):
         check_frame(frame, f"frames[{i}]", bits=known.bits, shape=known.shape_of(frame))
-        corrected, steps = known.corrected(frame, weigh=i == shown, before=stack[i - 1] if sequence and i else None)
-        out[i] = corrected.data[0]
-        said.append(steps)
+    shown = min(known.memory if sequence else 0, len(stack) - 1)  # the frame of which the steps are told
+    active = known.lit(stack)
     clipped = (active == 0) | (active == top)
+    early = [range(max(0, i - known.memory) if sequence else i, i) for i in range(len(stack))]  # the frames before each
+    name, factors = known.followed() if sequence else "", Factors()
+    if name:
+        lights = (known.corrected(f, before=list(stack[early[i]]), until=name)[0].data[0] for i, f in enumerate(stack))
+        factors = Factors.of([FrameLight.of(light, ends) for light, ends in zip(lights, clipped, strict=True)])
+    out = np.empty(active.shape, np.float32)
+    for i, frame in enumerate(stack):
+        corrected, steps = known.corrected(frame, i == shown, list(stack[early[i]]), factors.cut(early[i].start, i + 1))
+        out[i] = corrected.data[0]
+        said.append(factors.told(name, steps))
     return Correction(_together(said), out, steps=said[shown] if said else (), clipped=clipped, clipped_pixels=int(clipped.sum()))
 
 
@@ -635,25 +683,41 @@ def _correct_files(
     hashes = InputHashes(files[0].parent)
     told = progress or no_progress
     top = 2**known.bits - 1
-    shown = 1 if sequence and len(files) > 1 else 0  # the frame of which the steps are told
-    previous = dict(zip(files[1:], files, strict=False)) if sequence else {}
+    memory, name, factors = (known.memory, known.followed(), Factors()) if sequence else (0, "", Factors())
+    shown = min(memory, len(files) - 1)  # the frame of which the steps are told
 
-    def work(path: Path) -> tuple[Path, LoadedFrame, np.ndarray, tuple[FrameCorrection, ...], int]:
-        loaded = load_frame(path, raw=layout)
-        frame = loaded.array
-        check_frame(frame, str(path), bits=known.bits, shape=known.shape_of(frame))
-        before = load_frame(previous[path], raw=layout).array if path in previous else None
-        if before is not None:
-            check_frame(before, str(previous[path]), bits=known.bits, shape=frame.shape)
-        corrected, steps = known.corrected(frame, weigh=path == files[shown], before=before)
+    def loaded_with(i: int) -> tuple[LoadedFrame, list[np.ndarray]]:
+        loaded = load_frame(files[i], raw=layout)
+        check_frame(loaded.array, str(files[i]), bits=known.bits, shape=known.shape_of(loaded.array))
+        before = [load_frame(path, raw=layout).array for path in files[max(0, i - memory) : i]] if memory else []
+        for path, frame in zip(files[max(0, i - memory) : i], before, strict=False):
+            check_frame(frame, str(path), bits=known.bits, shape=loaded.array.shape)
+        return loaded, before
+
+    def ends(frame: np.ndarray) -> np.ndarray:
         lit = known.lit(frame[None])[0]
-        return path, loaded, corrected.data[0], steps, int(((lit == 0) | (lit == top)).sum())
+        return np.asarray((lit == 0) | (lit == top))
+
+    def light(i: int) -> FrameLight:
+        loaded, before = loaded_with(i)
+        return FrameLight.of(known.corrected(loaded.array, before=before, until=name)[0].data[0], ends(loaded.array))
+
+    def work(i: int) -> tuple[Path, LoadedFrame, np.ndarray, tuple[FrameCorrection, ...], int]:
+        loaded, before = loaded_with(i)
+        corrected, steps = known.corrected(loaded.array, i == shown, before, factors.cut(i - len(before), i + 1))
+        return files[i], loaded, corrected.data[0], factors.told(name, steps), int(ends(loaded.array).sum())
 
     said: list[tuple[FrameCorrection, ...]] = []
     clipped: dict[str, int] = {}
     of = [*known.files, *dict.fromkeys(path if path.is_dir() else path.parent for path in map(Path, frames))]
     with staged_output(output, "correction", of, [*files, *known.files]) as folder:
-        for i, (path, loaded, data, steps, at_ends) in enumerate(imap_tiles(work, files)):
+        if name:
+            lights = []
+            for found in imap_tiles(light, range(len(files))):
+                lights.append(found)
+                told("following the light of the frames", len(lights), len(files))
+            factors = Factors.of(lights)
+        for i, (path, loaded, data, steps, at_ends) in enumerate(imap_tiles(work, range(len(files)))):
             said.append(steps)
             if at_ends:
                 clipped[path.name] = at_ends
@@ -674,6 +738,36 @@ def _correct_files(
     return correction
 
 
+@dataclass(frozen=True)
+class Factors:
+    """Factors of the frames of a sequence, or why there are none."""
+
+    found: FrameFactors | None = None
+    why: str = ""
+
+    @classmethod
+    def of(cls, frames: Sequence[FrameLight]) -> Factors:
+        """What the frames tell."""
+        try:
+            return cls(factors_of_frames(frames))
+        except MeasureError as problem:
+            return cls(why=str(problem))
+
+    def cut(self, first: int, end: int) -> np.ndarray | None:
+        """Of a part of the frames."""
+        return None if self.found is None else self.found.factor_rel[first:end]
+
+    def told(self, name: str, steps: tuple[FrameCorrection, ...]) -> tuple[FrameCorrection, ...]:
+        """The steps, with what the factors are, or why there are none, at the source of that name."""
+        if not name:
+            return steps
+        if self.found is None:
+            return tuple(replace(s, text=f"not corrected: {self.why}") if s.name == name else s for s in steps)
+        low, high, u = (float(v) for v in (self.found.factor_rel.min(), self.found.factor_rel.max(), np.median(self.found.u_rel)))
+        text = f": factors from {low:.3f} to {high:.3f}, u {u:.1g}"
+        return tuple(replace(s, text=s.text + text) if s.name == name and s.corrected else s for s in steps)
+
+
 def _together(said: Sequence[tuple[FrameCorrection, ...]]) -> dict[str, str]:
     """What was done to all frames in a sentence a source, with the number of frames where it is not the same for all."""
     by_name: dict[str, list[str]] = {}
@@ -685,36 +779,6 @@ def _together(said: Sequence[tuple[FrameCorrection, ...]]) -> dict[str, str]:
 def _sentence(texts: Sequence[str]) -> str:
     counts = {text: texts.count(text) for text in dict.fromkeys(texts)}
     return texts[0] if len(counts) == 1 else "; ".join(f"{text} ({count} of {len(texts)} frames)" for text, count in counts.items())
-
-
-def _load(results: Path) -> tuple[int, Camera, dict[str, np.ndarray]]:
-    """Bits of the camera, the camera and its maps, each held against the digest that was taken when it was written."""
-    remedy = "name the results.json of an assessment"
-    if results.is_dir():
-        results = results / "results.json"
-    try:
-        record = json.loads(results.read_text(encoding="utf-8"))
-    except OSError as problem:
-        raise InputError("results cannot be read", where=str(results), value=problem.strerror, remedy=remedy) from None
-    except (ValueError, RecursionError):
-        raise InputError("is not JSON", where=str(results), remedy=f"{remedy}; if this is one, it is damaged: assess again") from None
-    if not isinstance(record, dict) or record.get("schema") != "pixmetry/results/1":
-        raise InputError("is not the result of an assessment", where=str(results), remedy=remedy)
-    digests = check_record(record, str(results))
-    for name in ("camera.yaml", "maps.zarr.zip"):
-        path = results.parent / name
-        if not path.is_file():
-            raise InputError(f"{name} is missing beside the results", where=str(results.parent), remedy="assess the camera again")
-        if name not in digests:
-            remedy = "assess the camera again"
-            raise InputError(f"the results contain no digest of {name}", where=str(results), remedy=remedy)
-        check_file(path, digests)
-    try:
-        bits = int(record["camera"]["bits"])
-    except (KeyError, TypeError, ValueError):
-        raise InputError("damaged results of an assessment", where=str(results), remedy="assess the camera again") from None
-    maps, _ = read_maps(results.parent / "maps.zarr.zip")
-    return bits, load_camera(results.parent / "camera.yaml"), maps
 
 
 def _named_once(files: list[Path]) -> list[Path]:

@@ -256,15 +256,19 @@ class Table:
 
     def rows(self, only: Collection[str] | None = None) -> list[SourceRow]:
         """Rows of the chain, then of what the catalogue has beyond it: all, or ``only`` those of these ids."""
+        return told_apart([self.row(*element) for element in self.elements(only)])
+
+    def elements(self, only: Collection[str] | None = None) -> list[tuple[Element, bool]]:
+        """What the rows are of, in their order, and whether it is in the camera."""
         camera = self.setting.camera
-        rows = [self.row(e, in_camera=True) for e in camera.active if only is None or e.source.id in only]
+        found = [(e, True) for e in camera.active if only is None or e.source.id in only]
         there = {e.source.id for e in camera.active}
         off = {e.source.id: e for e in camera.chain if not e.on}  # measured and not significant, or switched off
         for source in sources().values():
             if source.id not in there and (only is None or source.id in only):
                 usual = Element(source.id, source, self._own(source, self._usual(source)))
-                rows.append(self.row(usual if source.id in self.setting.brought_in else off.get(source.id, usual), in_camera=False))
-        return _told_apart(rows)
+                found.append((usual if source.id in self.setting.brought_in else off.get(source.id, usual), False))
+        return found
 
     # ---- one row --------------------------------------------------------------------------------------------------------------
 
@@ -572,7 +576,7 @@ class Table:
         return self._trials.alone(element).contribution(element.source.gum_class)
 
 
-def _told_apart(rows: list[SourceRow]) -> list[SourceRow]:
+def told_apart(rows: list[SourceRow]) -> list[SourceRow]:
     """The rows, with the name in the chain behind the title of a source that stands in it twice."""
     titles = [r.title for r in rows]
     return [replace(r, title=f"{r.title} ({r.name})") if titles.count(r.title) > 1 and r.name != r.source_id else r for r in rows]
@@ -609,4 +613,4 @@ def parts_of(found: Contribution, source_id: str = "") -> Parts:
     return Parts(found.bias_px, found.smooth_px, place, time)
 
 
-__all__ = ["Parts", "SourceRow", "Table", "independent_px", "stars_of"]
+__all__ = ["Parts", "SourceRow", "Table", "independent_px", "stars_of", "told_apart"]

@@ -56,6 +56,16 @@ class LevelMoments:
 
 
 @dataclass(frozen=True)
+class LevelRows:
+    """Means of the rows at several exposure levels, with the standard uncertainty that noise gives each."""
+
+    exposure_s: np.ndarray  # shape (levels,)
+    mean_dn: np.ndarray  # shape (levels, rows)
+    u_dn: np.ndarray  # shape (levels,)
+    fraction_max: np.ndarray  # shape (levels,): share of pixels at the highest code
+
+
+@dataclass(frozen=True)
 class PhotonTransfer:
     """A photon-transfer series: bright and dark levels of one camera at one gain and temperature."""
 
@@ -65,6 +75,8 @@ class PhotonTransfer:
     bits: int
     # shape (dark levels, 3): what hot pixels add to mean (DN) and spatial variance (DN²), and what of the mean was not seen but estimated
     dark_tails: np.ndarray | None = None
+    bright_rows: LevelRows | None = None
+    dark_rows: LevelRows | None = None
 
 
 @dataclass(frozen=True)
@@ -157,11 +169,13 @@ class TapSteps:
     """Gain of the taps by a flat field.
 
     ``fit`` has ``step_rel``, ``odd_even_rel`` and, where a border was found, ``taps``; it is empty where the flat field tells nothing.
-    ``gain``, shape (cols,), is that of every column as far as it was found.
+    ``gain``, shape (cols,), is that of every column as far as it was found. ``unseen_rel`` is the size that a step may have that was not
+    found: what all columns together fit best, with its u.
     """
 
     fit: Estimates
     gain: np.ndarray
+    unseen_rel: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,10 @@ from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 
 VERBS = ("forward", "measure", "correct", "propagate")
+MOVES_POINTS = (  # why a source has no ``correct``
+    "it moves points and leaves their grey values: resampling frames would correlate the noise of neighbours, and add an error of its own. "
+    "Instead, positions are corrected"
+)
 STATED_FRAME = (480, 640)  # rows and columns for which a bound is stated that depends on the frame
 
 
@@ -211,6 +215,24 @@ def run(source: Source, params: Any, signal: Signal, stream: Stream, state: Any 
         return source.forward(params, signal, stream), None
     following: tuple[Signal, Any] = source.forward(params, signal, stream, source.start(params) if state is None else state)
     return following
+
+
+def cut_rows(maps: Mapping[str, np.ndarray], name: str, signal: Signal, along: Literal["rows", "cols"] = "rows") -> np.ndarray:
+    """Cut what is told of every row (or column) of these frames, shape (n, rows of the frame), to the windows of a signal, as float32.
+
+    Raises
+    ------
+    InputError
+        If it is missing, or is not of these frames.
+    """
+    if name not in maps:
+        raise InputError(f"the correction needs {name!r} of these frames", allowed=", ".join(maps) or "nothing was given")
+    own, length = maps[name], signal.frame_shape[0 if along == "rows" else 1]
+    if own.shape != (len(signal), length):
+        raise InputError(f"{name!r} is not of these frames", value=own.shape, allowed=str((len(signal), length)))
+    places = signal.rows if along == "rows" else signal.cols
+    window: np.ndarray = np.take_along_axis(own, places, axis=1).astype(np.float32)
+    return window
 
 
 def cut_map(maps: Mapping[str, np.ndarray], name: str, signal: Signal) -> np.ndarray:

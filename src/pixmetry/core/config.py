@@ -77,10 +77,20 @@ def load_yaml(path: str | Path) -> Settings:
     InputError
         If the file cannot be read, is not YAML, repeats a key, or holds something else than a mapping.
     """
+    return parse_yaml(read_text(path), path)
+
+
+def parse_yaml(text: str, path: str | Path = "text") -> Settings:
+    """Read one YAML 1.2 mapping from a text; ``path`` is what messages call it.
+
+    Raises
+    ------
+    InputError
+        As `load_yaml`.
+    """
     from ruamel.yaml import YAML
     from ruamel.yaml.error import MarkedYAMLError, YAMLError
 
-    text = read_text(path)
     yaml = YAML(typ="safe", pure=True)
     try:
         data = yaml.load(text)
@@ -265,14 +275,15 @@ def dump_yaml(obj: Any, path: str | Path) -> None:
     yaml.width = 140
     data = obj.model_dump() if isinstance(obj, BaseModel) else obj
     with open(path, "w", encoding="utf-8", newline="\n") as stream:
-        yaml.dump(_plain(data), stream)
+        yaml.dump(plain_values(data), stream)
 
 
-def _plain(value: Any) -> Any:
+def plain_values(value: Any) -> Any:
+    """Mappings, lists, texts and numbers alone; keys whose value is None go."""
     if isinstance(value, Mapping):
-        return {str(k): _plain(v) for k, v in value.items() if v is not None}
+        return {str(k): plain_values(v) for k, v in value.items() if v is not None}
     if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
+        return [plain_values(v) for v in value]
     if isinstance(value, Path):
         return value.as_posix()
     return value.tolist() if hasattr(value, "tolist") else value

@@ -10,6 +10,8 @@ from pixmetry.core.errors import InputError
 EXTRAS = {  # module: package, extra of the installation that brings it, what needs it
     "cv2": ("opencv-python-headless", "opencv", "calibrating, and locating chessboards, lines and edges"),
     "pyarrow.parquet": ("pyarrow", "parquet", "writing a table as Parquet"),
+    "starlette": ("starlette", "bench", "the pages of `pixmetry bench` and `pixmetry view`"),
+    "uvicorn": ("uvicorn", "bench", "the pages of `pixmetry bench` and `pixmetry view`"),
     "av": ("av", "video", "the error source storage.video_codec"),
 }
 

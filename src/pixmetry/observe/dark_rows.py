@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pixmetry.camera.dark_rows import DarkRows, octave_covariance
-from pixmetry.camera.noise_covariance import WHITE, NoiseFilter
+from pixmetry.camera.noise_covariance import CHARGE, WHITE, NoiseFilter
 from pixmetry.camera.observations import PatternList, Spectra
 from pixmetry.camera.stated import StatedFacts
 from pixmetry.core.number import ONE_SIDED_95, Estimates
@@ -54,7 +54,7 @@ def reduce_dark_rows(
     patterns : PatternList or None
         Waves off the axes, which are no hum.
     noise_filter : NoiseFilter or None
-        Behind a filter the spectrum is not that of the camera's noise.
+        Behind a filter the spectrum is not that of the camera's noise; charge that repels charge does nothing to dark frames.
     """
     means = np.array([rows.means[i] for i in sorted(rows.means)])
     if len(means) < LEAST_FRAMES or min(shape) < LEAST_ROWS:
@@ -73,7 +73,7 @@ def reduce_dark_rows(
         taken["hum"] = (line[0] ** 2 / 2, line[0] * line[1])
     turn = (line[0], _turns_along(hum)) if line is not None and "per_col" in hum else (0.0, 0.0)
     lines = () if line is None else _ordinates_of(line[2], shape[0], scan)
-    if noise_filter is not None and noise_filter.kind != WHITE:
+    if noise_filter is not None and noise_filter.kind not in (WHITE, CHARGE):
         why = f"the frames are filtered ({noise_filter.name}), and their spectrum with them"
         flicker, fitted = replace(Estimates.empty(), reasons={"rms_dn": why}), np.full_like(power, np.nan)
     else:

@@ -124,7 +124,8 @@ def strongest_wave(value: np.ndarray, place: np.ndarray, row: np.ndarray, hum_pe
         return None
     wave = found.light(place, row) - 1
     wave = wave - wave.mean(axis=1, keepdims=True)
-    grid[k[:, None], row] = value - (wave - wave.mean(axis=0))
+    left = value - (wave - wave.mean(axis=0))
+    grid[k[:, None], row] = left
     floor = np.median(np.abs(np.fft.rfft2(grid)) ** 2, axis=0)[allowed]
     coloured = float(np.sqrt(max(floor[peak[1]] / np.mean(floor), 1.0)))
     u = {name: coloured * getattr(found, name) for name in ("u_amplitude_rel", "u_per_frame", "u_per_row")}

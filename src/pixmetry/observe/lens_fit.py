@@ -18,7 +18,7 @@ from pixmetry.observe.edges import Region, Spread
 
 PERIOD_PX = 128.0  # of the square wave that stands for an edge
 MOST_FREQUENCY = 6.0  # cycles/px
-NODES = 48  # of the integral over the common part of two pupils
+NODE, WEIGHT = np.polynomial.legendre.leggauss(48)  # of the integral over the common part of two pupils
 BETTER_CHI2 = 25.0  # by which χ² must be less than that of the Gaussian lens, and fall with a defocus
 NEAR_PX, MISFIT = 2.0, 6.0  # χ² per bin so near to the edge, from which on they follow neither; below it, u grows with its root
 WELL_FITTED, BETTER_NEAR = 2.0, 0.5  # above that χ² per bin, diffraction must have less than this part of that of the Gaussian lens
@@ -44,13 +44,12 @@ def defocused_response(s: Array, waves: float) -> Array:
     OTF = (4/π) ∫ √(1 − (x + s)²) cos(16√3 π W s x) dx from 0 to 1 − s; with x + s = sin t by Gauss and Legendre.
     """
     s = np.minimum(np.abs(np.asarray(s, float)), 1.0)
-    node, weight = np.polynomial.legendre.leggauss(NODES)
     low = np.arcsin(s)
     half = 0.5 * (0.5 * np.pi - low)
-    t = low[..., None] + half[..., None] * (node + 1)
+    t = low[..., None] + half[..., None] * (NODE + 1)
     x = np.sin(t) - s[..., None]
     phase = 16 * np.sqrt(3) * np.pi * waves * s[..., None] * x
-    out: Array = 4 / np.pi * (np.cos(t) ** 2 * np.cos(phase) * half[..., None]) @ weight
+    out: Array = 4 / np.pi * (np.cos(t) ** 2 * np.cos(phase) * half[..., None]) @ WEIGHT
     return out
 
 

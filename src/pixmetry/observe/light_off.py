@@ -175,8 +175,9 @@ def _not_a_share(steps: Sequence[LightStep]) -> int | None:
     excess = np.array([s.shares[1] - s.shares[0] ** 2 for s in steps])
     u = np.array([np.hypot(s.u_shares[1], 2 * s.shares[0] * s.u_shares[0]) for s in steps])
     light = np.array([s.signal_dn for s in steps])
-    brightest, dimmest = int(np.argmax(light)), int(np.argmin(light))
-    pocket = light[brightest] > POCKET_RANGE * light[dimmest] and excess[brightest] < 0.5 * excess[dimmest]
+    centred = np.log(light) - np.average(np.log(light), weights=u**-2)
+    slope, information = float((centred * excess / u**2).sum()), float((centred**2 / u**2).sum())
+    pocket = light.max() > POCKET_RANGE * light.min() and slope < -SIGNIFICANT * np.sqrt(information)
     limit = stdtrit([s.dof for s in steps], AGREES) * u
     wrong = np.abs(excess) > limit if not pocket else excess < -limit
     return int(np.argmax(np.abs(excess / u) * wrong)) if wrong.any() else None

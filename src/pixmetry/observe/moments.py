@@ -42,6 +42,7 @@ class LevelSummary:
     kurtosis_excess: float
     counts: np.ndarray
     spatial_cov_dn2: float
+    row_mean_dn: np.ndarray  # shape (rows,)
     tail: HotTail | None = None  # of the codes, where they were not kept one by one
 
 
@@ -215,6 +216,7 @@ class FrameMoments:
             kurtosis_excess=self.kurtosis_excess(),
             counts=self.counts,
             spatial_cov_dn2=self.spatial_covariance_dn2(),
+            row_mean_dn=self.mean_map_dn().mean(axis=1),
         )
 
 
@@ -316,6 +318,7 @@ def summarize_pair(first: np.ndarray, second: np.ndarray, bits: int) -> LevelSum
         kurtosis_excess=sums.powers.kurtosis_excess(),
         counts=counts.sum(axis=0),
         spatial_cov_dn2=_covariance(sums.frame_sums, first.size, 2.0 * sums.products),
+        row_mean_dn=sums.row_sums.sum(axis=0) / (2 * shape[1]),
     )
 
 

@@ -70,6 +70,7 @@ MEDIANS = {
 OF_MEDIAN = 0.02  # rounding and the skewness of the shot noise change these
 ALONG_LINE_REL = 0.04  # of a fixed contrast: jitter of the rows in the mean of the frames, echoes later than the lags
 RESOLVED = 10.0  # u of the shot variance of a level that counts
+OF_PIXELS, OF_COLUMNS = ("prnu_pixel_rel", "dsnu_pixel_dn"), ("prnu_col_rel", "dsnu_col_dn")
 LEAST_DOUBT = 0.1  # of the gain's u: a smaller part adds less than 0.5 % to it
 
 
@@ -502,6 +503,11 @@ def before_correlation(spatial: Estimates, found: NoiseFilter, shot_dn2: float) 
     shot_dn2 : float
         Shot variance of the stack of bright frames.
     """
+    if found.kind == UNKNOWN and not found.name.startswith(("demosaicking", MEDIAN)):
+        why = f"what correlates neighbouring pixels ({found.name}) changes the pattern too, and by how much is not told"
+        lost = [n for n in (*OF_PIXELS, *OF_COLUMNS) if n in spatial]
+        kept = spatial.select([n for n in spatial.names if n not in lost])
+        return replace(kept, reasons={**kept.reasons, **dict.fromkeys(lost, why)})
     if found.kind not in (CHARGE, WHITE, LINEAR) or shot_dn2 <= 0:
         return spatial
     scale, u = 1.0, 0.5 * found.u_factor
@@ -514,7 +520,7 @@ def before_correlation(spatial: Estimates, found: NoiseFilter, shot_dn2: float) 
         scale, u = float(np.sqrt(found.factor)), 0.5 * found.u_factor / found.factor
         if found.name == LINE:
             u = float(np.hypot(u, ALONG_LINE_REL))
-        evened += ["dsnu_pixel_dn", *(("prnu_col_rel", "dsnu_col_dn") if found.name == LINE else ())]
+        evened += ["dsnu_pixel_dn", *(OF_COLUMNS if found.name == LINE else ())]
     own = np.array([name in evened for name in spatial.names])
     factor = np.where(own, scale, 1.0)
     more = np.where(own, spatial.values * factor * u, 0.0)

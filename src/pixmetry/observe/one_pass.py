@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pixmetry.camera.group_facts import GroupFacts
-from pixmetry.camera.observations import LevelMoments, PhotonTransfer
+from pixmetry.camera.observations import LevelMoments, LevelRows, PhotonTransfer
 from pixmetry.core.errors import MeasureError
 from pixmetry.core.threads import imap_tiles
 from pixmetry.observe.defects import tail_of_counts
@@ -214,12 +214,25 @@ def photon_transfer(dark: Sequence[Level], bright: Sequence[Level], shape: tuple
     if shape is None or not (dark or bright):
         raise MeasureError("no frames", where="photon transfer", remedy="add groups of two frames or more")
     tails = [level.summary.tail or tail_of_counts(level.summary.counts) for level in dark]
-    return PhotonTransfer(_moments(bright), _moments(dark), shape, bits, np.array(tails).reshape(-1, 3))
+    return PhotonTransfer(_moments(bright), _moments(dark), shape, bits, np.array(tails).reshape(-1, 3), _rows(bright), _rows(dark))
 
 
 def without_levels(shape: tuple[int, int], bits: int) -> PhotonTransfer:
     """The series of a camera of which there are only pictures of targets: no dark and no bright level."""
     return PhotonTransfer(_moments([]), _moments([]), shape, bits, np.zeros((0, 3)))
+
+
+def _rows(levels: Sequence[Level]) -> LevelRows | None:
+    """Means of the rows of all levels; None without levels."""
+    if not levels:
+        return None
+    sums = [level.summary for level in levels]
+    return LevelRows(
+        np.array([level.exposure_s for level in levels], float),
+        np.array([s.row_mean_dn for s in sums]),
+        np.sqrt([max(s.squares.row_dn2, 0.0) / s.n_frames for s in sums]),
+        np.array([s.counts[-1] / s.counts.sum() for s in sums]),
+    )
 
 
 def _moments(levels: Sequence[Level]) -> LevelMoments:

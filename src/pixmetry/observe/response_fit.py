@@ -30,6 +30,9 @@ UNEVEN_REL = 0.05  # standard deviation of slopes and bow of the light over half
 GLARE_REL = 0.003  # light that the lens scatters, of the brightest patch, and the standard deviation of that
 BEND_REL = 0.01  # of a cubic non-linearity in front of a curve
 CUBIC_REL = 0.1  # of its coefficients where it is the curve itself
+HIGHER = 0.5  # of the bend of a noisy mean, times the relative variance of its light: what second order may be wrong by
+LEAST_DOUBT = 0.1  # of the u of a mean: less adds 0.5 %
+DISTANT = 100.0  # BIC by which a curve is so much worse that what it says of noise does not count
 CLEARLY = 10.0  # BIC by which a curve must be better
 MISFIT = 25.0  # χ² per degree of freedom: no curve describes the values
 ITERATIONS, RESTING = 60, 1e-7
@@ -179,13 +182,23 @@ def _model(curve: str, d: _Data, theta: Array, glare: float, shift: Array) -> tu
     light = d.light * np.exp(shift) + glare
     if np.isfinite(d.white).all():
         light = light * _relative_light(curve, theta, d.white, d.top_dn)
+    value, slope, _ = _noisy_mean(curve, d, theta, light)
+    return value, slope
+
+
+def _noisy_mean(curve: str, d: _Data, theta: Array, light: Array) -> tuple[Array, Array, Array]:
+    """Means of noisy pixels at these lights, by second order, slopes by ln(light), and what the higher orders may add.
+
+    Of a power curve the fourth order is (γ − 2)(γ − 3)/4 times the second one times (σ/light)², about 1 for γ = 0.45, and the third order
+    takes half of it or more off again.
+    """
     h = 1e-3
     low, here, high = (curve_dn(curve, theta, light * f, d.top_dn) for f in (1 - h, 1.0, 1 + h))
     slope = (high - low) / (2 * h)
     second = (high - 2 * here + low) / h**2
-    safe = np.maximum(np.abs(slope), 1e-9)
-    bend = 0.0 if curve == KNEE else np.clip(0.5 * second * d.spread / safe**2, -0.3 * np.abs(here), 0.3 * np.abs(here))
-    return here + bend, slope
+    relative = d.spread / np.maximum(np.abs(slope), 1e-9) ** 2
+    bend = np.zeros(len(here)) if curve == KNEE else np.clip(0.5 * second * relative, -0.3 * np.abs(here), 0.3 * np.abs(here))
+    return here + bend, slope, np.abs(bend) * np.minimum(HIGHER * relative, 1.0)
 
 
 def _relative_light(curve: str, theta: Array, white: Array, top_dn: float) -> Array:
@@ -339,7 +352,25 @@ def _starts(curve: str, d: _Data) -> list[Array]:
 
 
 def fit_curves(d: _Data) -> list[_Fit]:
-    """All curves that can be fitted, the best first; a straight one unless another is clearly better."""
+    """All curves that can be fitted, the best first; a straight one unless another is clearly better.
+
+    Where noise is a large part of the light, a mean is known no better than its bend: u is widened by what any likely curve says of that.
+    """
+    fits = _fits(d)
+    near = [f for f in fits if f.bic < fits[0].bic + DISTANT]
+    doubts = [_noisy_mean(f.curve, d, f.theta, _light_at(f.curve, f.theta, d.y, d.top_dn))[2] for f in near]
+    if doubts and (np.max(doubts, axis=0) > LEAST_DOUBT * d.u).any():
+        fits = _fits(replace(d, u=np.hypot(d.u, np.max(doubts, axis=0))))
+    if not fits:
+        return []
+    fits = [_with_other_knees(f, d) if f.curve == KNEE and f.bic < fits[0].bic + CLEARLY else f for f in fits]
+    close = [f for f in fits if f is fits[0] or (f.curve in (LINEAR, CUBIC) and f.bic < fits[0].bic + CLEARLY)]
+    best = min(close, key=lambda f: CURVES.index(f.curve))
+    return [best, *(f for f in fits if f is not best)]
+
+
+def _fits(d: _Data) -> list[_Fit]:
+    """All curves that can be fitted, by their BIC."""
     fits = []
     for curve in CURVES:
         if len(d.y) <= len(NAMES[curve]) + 2:
@@ -347,13 +378,7 @@ def fit_curves(d: _Data) -> list[_Fit]:
         found = [f for f in (_fit_from(curve, d, start) for start in _starts(curve, d)) if f is not None and _lawful(f)]
         if found:
             fits.append(min(found, key=lambda f: f.chi2))
-    fits.sort(key=lambda f: f.bic)
-    if not fits:
-        return []
-    fits = [_with_other_knees(f, d) if f.curve == KNEE and f.bic < fits[0].bic + CLEARLY else f for f in fits]
-    close = [f for f in fits if f is fits[0] or (f.curve in (LINEAR, CUBIC) and f.bic < fits[0].bic + CLEARLY)]
-    best = min(close, key=lambda f: CURVES.index(f.curve))
-    return [best, *(f for f in fits if f is not best)]
+    return sorted(fits, key=lambda f: f.bic)
 
 
 def _lawful(f: _Fit) -> bool:

@@ -30,11 +30,14 @@ MOST_CLIPPED = 1e-3  # share of a frame's pixels
 LEAST_LIGHT = 0.02  # of a frame over the median of all
 MOST_PAUSE = 100  # frame times, after which another sequence begins
 MOST_ROUNDS = 40  # of factors and bands in turn
+MOST_U_FACTOR = 0.01  # u of the factor of a frame
 MOVES = 5.0  # u beyond which gains, and the black, are said to move
 BLACK_CHANCE = 1e-4
 METHOD = "factor of each frame on what does not change in the scene, over the means of the frames before it"
 SWITCH_GAIN = "take 40 frames or more in a row in which a bright patch, a quarter of the frame, comes and goes every 7 to 20 frames"
 WHOLE_FRAME = "of the mean of these frames; a loop that weighs the middle more, or sees more than this window, has its own target"
+ONLY_STAYS = "only {:.0f} % of the frame stays as it is from frame to frame"
+AT_REST = "keep camera and scene at rest; only a patch of at most half of the frame may change"
 NO_ORDER = "list the frames in the order in which they were taken"
 
 
@@ -53,12 +56,10 @@ class SequenceSums:
 
     def add(self, frame: np.ndarray, index: int) -> None:
         """Add the frame of this index."""
-        tall, wide = (block_px(n) for n in frame.shape)
-        rows, cols = frame.shape[0] // tall, frame.shape[1] // wide
-        parts = frame[: rows * tall, : cols * wide].reshape(rows, tall, cols, wide)
+        parts = _in_blocks(frame)
         self.blocks[index] = parts.mean(axis=(1, 3), dtype=float)
         self.lowest[index], self.highest[index] = parts.min(axis=(1, 3)), parts.max(axis=(1, 3))
-        self.rows[index] = np.stack([part.mean(axis=1, dtype=float) for part in np.array_split(frame, SEGMENTS, axis=1)], axis=1)
+        self.rows[index] = _row_means(frame)
         self.pixels[index] = frame[sample_places(frame.shape)].copy()
         self.means[index] = float(frame.mean(dtype=float))
         top = int(frame.max())
@@ -71,6 +72,98 @@ class SequenceSums:
         highest = max(code for code, _, _ in self.codes.values())
         full = max(share for code, share, _ in self.codes.values() if code == highest) > MOST_CLIPPED
         return highest if full and (highest + step) & (highest + step - 1) == 0 else 2**bits - step
+
+
+def _in_blocks(frame: np.ndarray) -> np.ndarray:
+    """The frame as blocks, shape (blocks down, rows of one, blocks across, columns of one)."""
+    tall, wide = (block_px(n) for n in frame.shape)
+    rows, cols = frame.shape[0] // tall, frame.shape[1] // wide
+    return frame[: rows * tall, : cols * wide].reshape(rows, tall, cols, wide)
+
+
+def _row_means(frame: np.ndarray) -> np.ndarray:
+    """Means of parts of the rows, shape (rows, segments)."""
+    return np.stack([part.mean(axis=1, dtype=float) for part in np.array_split(frame, SEGMENTS, axis=1)], axis=1)
+
+
+@dataclass(frozen=True)
+class FrameLight:
+    """What is kept of a frame to follow its factor: means of blocks and of parts of rows, DN above black; which blocks are not clipped."""
+
+    blocks: np.ndarray
+    rows: np.ndarray
+    usable: np.ndarray
+
+    @classmethod
+    def of(cls, frame_dn: np.ndarray, clipped: np.ndarray) -> FrameLight:
+        """Of a frame above black and the mask of its clipped pixels, shape (rows, cols) both."""
+        usable: np.ndarray = np.logical_not(_in_blocks(clipped).any(axis=(1, 3)))
+        return cls(_in_blocks(frame_dn).mean(axis=(1, 3), dtype=float), _row_means(frame_dn), usable)
+
+
+@dataclass(frozen=True)
+class FrameFactors:
+    """Factors of frames in a row against the mean of all.
+
+    Parameters
+    ----------
+    factor_rel : ndarray, shape (frames, rows)
+        Gain, exposure and lamp as one; 1 for frames without light.
+    u_rel : ndarray, shape (frames,)
+    bands : LampWave or None
+        The part of it that differs from row to row.
+    static_share : float
+        Share of the frame that tells it.
+    """
+
+    factor_rel: np.ndarray
+    u_rel: np.ndarray
+    bands: LampWave | None
+    static_share: float
+
+
+def factors_of_frames(frames: Sequence[FrameLight]) -> FrameFactors:
+    """Factor of each frame of a sequence without gaps against the mean of all, by the parts of the scene that do not change.
+
+    Raises
+    ------
+    MeasureError
+        With fewer than `LEAST_FRAMES` frames, or where too little of the scene stays as it is.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from pixmetry.observe.sequence import FrameLight, factors_of_frames
+    >>> scene, gain = 100 + np.arange(64.0 * 64).reshape(64, 64) / 40, 1 + 0.1 * np.sin(np.arange(16))
+    >>> found = factors_of_frames([FrameLight.of(g * scene, np.zeros((64, 64), bool)) for g in gain])
+    >>> bool(np.allclose(found.factor_rel[:, 0], gain / gain.mean()))
+    True
+    """
+    if len(frames) < LEAST_FRAMES:
+        raise MeasureError(f"{len(frames)} frames, {LEAST_FRAMES} are needed", remedy=f"give {LEAST_FRAMES - len(frames)} frames more")
+    blocks, rows = np.array([f.blocks.ravel() for f in frames]), np.array([f.rows for f in frames])
+    levels = blocks.mean(axis=1)
+    lit = levels > LEAST_LIGHT * np.median(levels)
+    if lit.sum() < LEAST_FRAMES or np.median(levels) <= 0:
+        raise MeasureError("the frames show no light", remedy="give frames of a lit scene")
+    usable = np.all([f.usable.ravel() for f, light in zip(frames, lit, strict=True) if light], axis=0)
+    if usable.mean() < LEAST_STATIC:
+        raise MeasureError("nearly all of the frame is clipped in some frames", remedy="take less light")
+    place, row = np.flatnonzero(lit).astype(float), np.arange(rows.shape[1])
+    wave = _bands(rows[lit], blocks[lit], usable, frames[0].blocks.shape, place, (0.0, 0.0), 0.0)
+    bands = None if wave is None or wave.of_fields else wave
+    light = np.ones((int(lit.sum()), rows.shape[1])) if bands is None else bands.light(place, row)
+    even = blocks[lit] / _by_block(light, frames[0].blocks.shape)
+    static = static_blocks(even, usable)
+    if static.mean() < LEAST_STATIC:
+        raise MeasureError(ONLY_STAYS.format(100 * static.mean()), remedy=AT_REST)
+    found = _factors(even, static, 0.0)
+    if float(np.median(found.covariance[:, 0, 0])) > MOST_U_FACTOR**2:
+        what = f"their factors are known to {float(np.sqrt(np.median(found.covariance[:, 0, 0]))):.1g} only"
+        raise MeasureError(what, remedy=f"{AT_REST}; or take more light")
+    factor, u = np.ones((len(frames), rows.shape[1])), np.zeros(len(frames))
+    factor[lit], u[lit] = found.gain[:, None] * light, np.sqrt(found.covariance[:, 0, 0])
+    return FrameFactors(factor, u, bands, float(static.mean()))
 
 
 def block_px(side: int) -> int:
@@ -173,8 +266,7 @@ def sequence_of(group: PictureGroup, dark: tuple[float, float] | None, order: np
         blocks = dark[0] + (blocks - dark[0]) / _by_block(light, sums.blocks[0].shape)
     static = static_blocks(blocks, usable)
     if static.mean() < LEAST_STATIC:
-        what = f"only {100 * static.mean():.0f} % of the frame stays as it is from frame to frame"
-        raise MeasureError(what, remedy="keep camera and scene at rest; only a patch of at most half of the frame may change")
+        raise MeasureError(ONLY_STAYS.format(100 * static.mean()), remedy=AT_REST)
     free = _factors(blocks, static)
     black, moves = _black_of(free)
     notes = []
@@ -189,7 +281,7 @@ def sequence_of(group: PictureGroup, dark: tuple[float, float] | None, order: np
         how = f"black moves by {moves:.2g} DN from frame to frame (standard deviation)"
         notes.append(f"{how}: an automatic black level, or a clamp that settles")
     factors = free if moves or black is None else _factors(blocks, static, black[0])
-    if not moves and black is not None and float(np.median(factors.covariance[:, 0, 0])) > 1e-4:
+    if not moves and black is not None and float(np.median(factors.covariance[:, 0, 0])) > MOST_U_FACTOR**2:
         raise MeasureError("the frames are too dark, or too noisy, to follow their gain", remedy="take more light")
     codes = [sums.codes[i] for i in order]
     full = [share if code >= top else 0.0 for code, share, _ in codes]
@@ -253,6 +345,8 @@ def _bands(
     free, mean = blocks, rows.mean(axis=0)
     for _ in range(MOST_ROUNDS):
         found = _factors(free, about)
+        if dark is not None and float(np.median(found.covariance[:, 0, 0])) > MOST_U_FACTOR**2:
+            found = _factors(free, about, black)  # an even scene does not tell a factor from an offset
         before, wave = wave, row_wave(rows, mean, found.gain, found.offset, black, about.reshape(shape), place, wave, hum_per_row)
         if wave is None or wave.of_fields:
             return wave

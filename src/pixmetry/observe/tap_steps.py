@@ -10,12 +10,14 @@ import numpy as np
 from pixmetry.camera.observations import StackMoments, TapSteps
 from pixmetry.core.arrays import Array
 from pixmetry.core.number import ONE_SIDED_95, Estimates
+from pixmetry.observe.noise_filter import unseen_rms
 from pixmetry.observe.surface import orthonormal_polynomials
 
 SIDE_COLS = 8  # columns on each side of a border
 LEAST_COLS, MOST_CLIPPED, FOUND_Z = 96, 0.002, 5.0
 AT_BORDER_Z, ALIKE_Z = 2.0, 4.0  # u of a step at the borders, and of its difference to that of all columns
 TAPS = (2, 3, 4, 6, 8)  # that are looked for
+LARGEST_UNSEEN, TAPS_PRESENT = 0.02, 0.1  # relative step between two taps, and the chance of one, before anything is measured
 LIGHT_DEGREE = 4  # of the light along the columns, as of the surface that is taken from a flat field
 LAGS = 4  # columns over which what is left may be correlated
 METHOD = "column medians of bright less dark stack: steps at the borders of equal parts, and odd columns against even ones"
@@ -56,11 +58,12 @@ def find_taps(dark: StackMoments, bright: StackMoments, mosaic: bool) -> TapStep
         odd_even, var_odd_even = float(values[0]), float(covariance[0, 0])
     found, dof = _borders(means - odd_even * parity)
     limits, reasons = set(), {}
-    taps, step, u_step, told = 2, 0.0, 0.0, False
+    taps, step, u_step, told, unseen = 2, 0.0, 0.0, False, 0.0
     for number, (near, u_near) in found.items():
         side = _sides(cols, number)
         values, covariance = _fitted(means, basis, [side] if mosaic else [side, parity])
         size, u = float(values[0]), float(np.sqrt(covariance[0, 0]))
+        unseen = unseen_rms(abs(size), u, LARGEST_UNSEEN, present=TAPS_PRESENT) if number == 2 else unseen
         seen = abs(near) > AT_BORDER_Z * u_near and abs(near - size) < ALIKE_Z * u_near
         if seen and abs(size) > FOUND_Z * u and abs(size) * u_step >= abs(step) * u:
             taps, step, u_step, told = number, size, u, True
@@ -88,7 +91,7 @@ def find_taps(dark: StackMoments, bright: StackMoments, mosaic: bool) -> TapStep
     if told:
         rows.append(("taps", float(taps), 0.0, np.inf, "1"))
     fit = Estimates.from_rows(rows, method=METHOD, confounders=CONFOUNDERS, limits=frozenset(limits), reasons=reasons)
-    return TapSteps(fit, gain)
+    return TapSteps(fit, gain, 0.0 if told else unseen)
 
 
 def _sides(cols: int, taps: int) -> Array:
@@ -148,13 +151,26 @@ def evened(dark: StackMoments, bright: StackMoments, taps: TapSteps) -> StackMom
 
 
 def with_steps_in_slope(spatial: Estimates, taps: TapSteps) -> Estimates:
-    """The gradient of the light along x with what the step that was taken off may be wrong by."""
-    name = "shading_x_per_px"
-    if name not in spatial or "step_rel" not in taps.fit or "step_rel" in taps.fit.limits:
+    """The gradient of the light along x, and the columns' own pattern, with what steps may do to them.
+
+    A step that was taken off is wrong by its u. One between two taps that was not found may be there with the size that the columns fit
+    best: it is part of the gradient, and what the light does not take up of it is part of the scatter of the columns.
+    """
+    u = taps.unseen_rel
+    number = 2
+    if "step_rel" in taps.fit and "step_rel" not in taps.fit.limits:
+        u, number = taps.fit["step_rel"].u, round(taps.fit["taps"].value)
+    if not u:
         return spatial
-    cols, at = len(taps.gain), spatial.index(name)
+    cols, covariance = len(taps.gain), spatial.covariance.copy()
     basis, slopes = orthonormal_polynomials(cols, LIGHT_DEGREE)
-    by_step = float(slopes @ (basis.T @ _sides(cols, round(taps.fit["taps"].value))))
-    covariance = spatial.covariance.copy()
-    covariance[at, at] += (by_step * taps.fit["step_rel"].u) ** 2
+    side = _sides(cols, number)
+    if "shading_x_per_px" in spatial:
+        at = spatial.index("shading_x_per_px")
+        covariance[at, at] += (float(slopes @ (basis.T @ side)) * u) ** 2
+    if taps.unseen_rel and "prnu_col_rel" in spatial:
+        left, found = side - basis @ (basis.T @ side), spatial["prnu_col_rel"]
+        covariance[spatial.index("prnu_col_rel"), spatial.index("prnu_col_rel")] += (
+            0.0 if found.is_limit else (float(left @ left) / cols * u**2 / (2 * found.value)) ** 2
+        )
     return replace(spatial, covariance=covariance)

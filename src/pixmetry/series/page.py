@@ -100,6 +100,19 @@ def stable_sentence(drift: DriftSeries) -> str:
     return f"{when}, every point stays within {limit} of where it settles{extrapolated}."
 
 
+def outlook_sentence(drift: DriftSeries) -> str:
+    """How far the image still is from where it settles, and in how many minutes it will be near enough, in a sentence."""
+    stable, last = drift.stable, float(drift.time_s[-1])
+    far, u = (float(v[-1]) for v in (drift.from_settled_px, drift.u_from_settled_px))
+    if not stable.is_available or stable.kind == LOWER_LIMIT or not np.isfinite(far + u):
+        return stable_sentence(drift)
+    still = f"{significant(far, 2)} ± {significant(u, 1)} px to go"
+    if stable.value <= last:
+        return f"{still}. {stable_sentence(drift)}"
+    minutes, u_min = (stable.value - last) / 60, stable.u / 60
+    return f"{still}; stable (within {drift.tolerance_px:g} px) in {significant(minutes, 2)} ± {significant(u_min, 1)} min"
+
+
 def focus_sentence(drift: DriftSeries) -> str:
     """Whether the focus changes, in a sentence."""
     change = drift.focus

@@ -254,19 +254,30 @@ def _bandwidth(frequency: Array, parts: Array, jitter_px2: float, direct_px: flo
 
 
 def _way(frequency: Array, parts: Array, known: Array, held: bool) -> _Way | None:
-    """The bandwidth of every block of rows, where known factors lower the contrast too; None where fewer than three show it."""
+    """The bandwidth of every block of rows, where known factors lower the contrast too; None where fewer than three show it.
+
+    A frequency at which the scene has little contrast counts as much less as the blocks scatter more there than at others, and not at all
+    where half of them do not show it.
+    """
     from scipy.optimize import minimize_scalar
 
     found, left = [], []
+    scatter = np.full(len(frequency), np.inf)
+    told = np.isfinite(parts).sum(axis=0) > max(len(parts) // 2, 1)
+    if not told.any():
+        return None
+    scatter[told] = np.nanvar(parts[:, told], axis=0, ddof=1)
+    usual = max(float(np.median(scatter[told])), 1e-12)
+    root = np.sqrt(usual / (scatter + usual))  # of the weight
     for part in parts:
         seen = np.isfinite(part)
         if seen.sum() < 4:
             continue
 
         def off(logarithm: float, part: Array = part, seen: np.ndarray = seen) -> Array:
-            model = known * bessel_gain(frequency, float(np.exp(logarithm)), held=held)
-            scale = float(model[seen] @ part[seen] / (model[seen] @ model[seen]))
-            return np.asarray(part - scale * model)
+            model, value = root * known * bessel_gain(frequency, float(np.exp(logarithm)), held=held), root * part
+            scale = float(model[seen] @ value[seen] / (model[seen] @ model[seen]))
+            return np.asarray(value - scale * model)
 
         best = minimize_scalar(
             lambda logarithm, off=off: float(np.nansum(off(logarithm) ** 2)), bounds=(np.log(0.02), np.log(5.0)), method="bounded"

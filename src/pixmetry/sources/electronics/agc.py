@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from pydantic import model_validator
 
 from pixmetry.camera.contribution import Contribution, Probe
 from pixmetry.camera.observations import Observations, of_pictures
 from pixmetry.camera.signal import Kind, Signal, Windows
-from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.camera.source import Parameters, Source, cut_rows, quantity
 from pixmetry.core.errors import MeasureError, ParameterError
 from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
@@ -74,6 +76,14 @@ def measure(observations: Observations) -> Estimates:
     return told
 
 
+def correct(params: Agc, signal: Signal, maps: Mapping[str, np.ndarray]) -> Signal:
+    """Divide each frame by its factor against the mean of all, as the parts of the scene that do not change tell it.
+
+    ``maps["factor_rel"]`` has shape (n, rows of the frame): gain, exposure and lamp as one.
+    """
+    return signal.with_data(signal.data / cut_rows(maps, "factor_rel", signal)[:, :, None])
+
+
 def propagate(params: Agc, probe: Probe) -> Contribution:
     """A common factor moves no centroid whose background and threshold follow it, unless it lifts the target beyond the scale's end.
 
@@ -110,6 +120,7 @@ SOURCE = Source(
     bound=Agc(kappa=0.3, highest_db=32.0),
     forward=forward,
     measure=measure,
+    correct=correct,
     propagate=propagate,
     context=context,
     start=start,
@@ -118,7 +129,5 @@ SOURCE = Source(
     typical_size="no shift if the threshold follows the frame; 0.03 to 0.09 px with a hard threshold at a fixed DN",
     references=("K. J. Åström, R. M. Murray, Feedback Systems, Princeton 2008 (first-order discrete loop)",),
     advice="Switch it off.",
-    reasons={
-        "correct": "a frame does not contain its gain; lock the gain, or set the threshold relative to the target's peak",
-    },
+    leaves="the mean factor of all frames, the noise of each factor, and the noise that the gain amplified",
 )

@@ -108,5 +108,8 @@ SOURCE = Source(
     typical_size="0.004 px for 88 e- on a disc of 7 px at 15 000 electrons; with the shot noise 0.0057 px",
     references=("EMVA 1288 R4.0 Linear, §2.2 and §6.5", "J. R. Janesick, Photon Transfer, SPIE Press 2007, ch. 11"),
     advice="Read out more slowly, use more light, or average N frames (1/√N).",
-    reasons={"correct": "noise cannot be removed from a single frame; averaging frames lowers it"},
+    reasons={
+        "correct": "a frame with other noise and another scene has the same values: noise cannot be removed from a single frame. "
+        "Averaging frames lowers it"
+    },
 )

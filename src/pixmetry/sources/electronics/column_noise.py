@@ -11,7 +11,7 @@ from pixmetry.camera.contribution import Contribution, Probe
 from pixmetry.camera.noise_covariance import CHARGE, WHITE
 from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal
-from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.camera.source import Parameters, Source, cut_rows, quantity
 from pixmetry.core.errors import MeasureError
 from pixmetry.core.number import ONE_SIDED_95, Estimates
 from pixmetry.core.random import Grid, Stream
@@ -129,6 +129,14 @@ def _column_spread(observations: Observations) -> float:
     return float(light.std() / light.mean()) if light.mean() > 0 else 0.0
 
 
+def correct(params: ColumnNoise, signal: Signal, maps: Mapping[str, np.ndarray]) -> Signal:
+    """Subtract the offset of each column that the covered rows above and below it tell, as far as it is not their own noise.
+
+    ``maps["column_offset_dn"]`` has shape (n, columns of the frame): the offsets of these frames.
+    """
+    return signal.with_data(signal.data - cut_rows(maps, "column_offset_dn", signal, along="cols")[:, None, :])
+
+
 def propagate(params: ColumnNoise, probe: Probe) -> Contribution:
     """Propagator P1 with the errors of each column in common: a constant one, and one that grows with the signal.
 
@@ -154,6 +162,7 @@ SOURCE = Source(
     bound=ColumnNoise(offset_dn=0.5, gain_rel=0.002),
     forward=forward,
     measure=measure,
+    correct=correct,
     propagate=propagate,
     truth=truth,
     gum_class="Tr",
@@ -161,7 +170,5 @@ SOURCE = Source(
     typical_size="0.0155 px per DN in x on a disc of 7 px in a window of radius 6 px",
     references=("EMVA 1288 R4.0 Linear, §8.2 (row and column split)",),
     advice="Subtract each column's mean over optically black rows of the same frame; renew dark frames often.",
-    reasons={
-        "correct": "needs optically black rows above or below the image (covered in the camera's facts), in frames stored with them",
-    },
+    leaves="the gains of the columns, and the noise of the covered pixels' mean, as far as the weight of the offsets lets it through",
 )

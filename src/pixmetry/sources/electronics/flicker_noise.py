@@ -92,6 +92,8 @@ def measure(observations: Observations) -> Estimates:
     found = told.scaled({"rms_dn": (1 / gain.value, "e-")}).select({"rms_e": "rms_dn", **{n: n for n in told.names if n != "rms_dn"}})
     covariance = found.covariance.copy()
     covariance[0, 0] += (found.values[0] * gain.u / gain.value) ** 2
+    if found["rms_e"].is_limit:
+        return replace(found, covariance=covariance)
     assumed = "assumed, from one to two times the pixels of a row: state camera.line_time_us and pixel_clock_mhz"
     why = {"line_px": assumed} if rows.u_line_px else {}
     line = Estimates.from_rows([("line_px", rows.line_px, rows.u_line_px, np.inf, "px")], reasons=why)
@@ -148,6 +150,7 @@ SOURCE = Source(
     ),
     advice="Use correlated double sampling with a short interval; clamp every row on its optically black pixels.",
     reasons={
-        "correct": "noise cannot be removed; optically black columns remove the part that is common to a row",
+        "correct": "a frame with other noise and another scene has the same values. Optically black columns remove the part that is "
+        "common to a row, as electronics.row_noise",
     },
 )

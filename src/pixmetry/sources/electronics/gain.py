@@ -59,7 +59,7 @@ SOURCE = Source(
     references=("EMVA 1288 R4.0 Linear, §2.2 and §6.5, eq. 16–18",),
     advice="Set the gain so that one step of the converter is about the dark noise.",
     reasons={
-        "correct": "a common factor is not an error of the image",
+        "correct": "a factor common to all pixels is no error of the image. One that changes from frame to frame is electronics.agc",
         "propagate": "it scales all pixels alike and moves no target; noise and quantisation are sources of their own",
         "neutral": "it is a conversion: without it there is no digital signal",
     },

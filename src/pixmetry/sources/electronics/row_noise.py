@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from pixmetry.camera.contribution import Contribution, Probe
 from pixmetry.camera.dark_rows import without_variance
 from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal
-from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.camera.source import Parameters, Source, cut_rows, quantity
 from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 
@@ -51,6 +53,14 @@ def measure(observations: Observations) -> Estimates:
     return without_variance(noise, "row_e", square, u, "hum or 1/f noise, which is measured by itself,")
 
 
+def correct(params: RowNoise, signal: Signal, maps: Mapping[str, np.ndarray]) -> Signal:
+    """Subtract the offset of each row that the covered columns beside it tell, as far as it is not their own noise.
+
+    ``maps["row_offset_dn"]`` has shape (n, rows of the frame): the offsets of these frames.
+    """
+    return signal.with_data(signal.data - cut_rows(maps, "row_offset_dn", signal)[:, :, None])
+
+
 def propagate(params: RowNoise, probe: Probe) -> Contribution:
     """Propagator P1 with the errors of each row, and of each column, in common."""
     rows, columns = probe.rows(probe.gain_dn_per_e * params.row_e), probe.columns(probe.gain_dn_per_e * params.column_e)
@@ -70,11 +80,12 @@ SOURCE = Source(
     bound=RowNoise(row_e=5.0, column_e=2.0),
     forward=forward,
     measure=measure,
+    correct=correct,
     propagate=propagate,
     gum_class="Tr",
     equation="n' = n + σ_row z_r + σ_col z_c",
     typical_size="0.0155 px per DN in y on a disc of 7 px in a window of radius 6 px",
     references=("EMVA 1288 R4.0 Linear, §8.2 (row and column split)",),
     advice="Subtract each row's offset, measured in optically black columns, or average frames.",
-    reasons={"correct": "needs optically black columns beside the image (covered in the camera's facts), in frames stored with them"},
+    leaves="the noise of the covered pixels' mean, as far as the weight of the offsets lets it through, and the noise of the columns",
 )

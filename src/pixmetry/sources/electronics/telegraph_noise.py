@@ -261,6 +261,7 @@ SOURCE = Source(
     ),
     advice="Mask the pixels whose temporal histogram has two or three peaks, or weight them by their own variance.",
     reasons={
-        "correct": "the state of the trap in a single frame is unknown; mask the pixel",
+        "correct": "a value that blinks up and light that is brighter look the same in a single frame. Mask the pixel; in a sequence of "
+        "a scene at rest the median over the frames is free of it",
     },
 )

@@ -100,7 +100,8 @@ SOURCE = Source(
     references=("K. Ogata, Modern Control Engineering, 5th ed., §5-3 (second-order systems)",),
     advice="Load the output with its 75 Ω; use a camera with a flat video band, or a digital one.",
     reasons={
-        "correct": "inverting a filter from samples at the pixel rate needs the response between the samples, and amplifies the noise",
+        "correct": "samples at the pixel rate do not tell the line between them, which its inverse needs, and the inverse amplifies the "
+        "noise. Its delay moves all targets alike, and is part of the principal point",
         "neutral": "every amplifier has an upper frequency limit; switch the source off for a line without limit",
     },
 )

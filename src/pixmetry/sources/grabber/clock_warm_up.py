@@ -129,6 +129,7 @@ SOURCE = Source(
     references=("H. A. Beyer, IAPRS XXIX-B5, 1992, 561 (line-start lock of frame grabbers)",),
     advice="Wait 90 minutes, or sample with the camera's pixel clock. Otherwise estimate a scale along the row for every image.",
     reasons={
-        "correct": "coordinates are corrected, not images: the targets of an image give its scale",
+        "correct": "it moves points along the rows, and resampling frames would correlate the noise of neighbours. The targets of an "
+        "image give its scale: coordinates are corrected instead (`pixmetry corrected --per-image scale`)",
     },
 )

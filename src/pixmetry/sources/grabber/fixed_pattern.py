@@ -176,5 +176,8 @@ SOURCE = Source(
     typical_size="0.035 px for a ramp of 0.2 DN a row under a disc of 7 px of 150 DN (centroid, window radius 6)",
     references=("EMVA 1288 R4.0 Linear, §8.2 (row, column and pixel parts)",),
     advice="Do not use the first lines. Subtract a mean dark frame of the same grabber, or the background around each target.",
-    reasons={"correct": "subtracting the mean dark frame removes it together with the sensor's own dark pattern: sensor.dsnu does that"},
+    reasons={
+        "correct": "subtracting the mean dark frame removes it together with the sensor's own dark pattern, and dark frames do not tell "
+        "the two apart. What it settles by at the top of the frame is corrected with them, by sensor.dsnu"
+    },
 )

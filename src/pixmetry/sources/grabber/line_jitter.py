@@ -145,6 +145,7 @@ SOURCE = Source(
     references=("H. A. Beyer, IAPRS XXIX-B5, 1992, 561 (shear and jitter of line-locked grabbers; below 0.005 px with the pixel clock)",),
     advice="Sample with the camera's pixel clock, or average frames. A digital camera has no line jitter.",
     reasons={
-        "correct": "needs the shift of every row in the same frame, for instance from a line beside the targets",
+        "correct": "a row that is shifted and a scene that is shifted there look the same: the correction needs a reference in every row "
+        "of the same frame. With a straight line beside the targets, `pixmetry corrected --per-image rows` takes the jitter off",
     },
 )

@@ -106,6 +106,7 @@ SOURCE = Source(
     advice="Switch it off, unless the signal contains frequencies above half the sampling frequency. Calibrate and measure with the "
     "same setting.",
     reasons={
-        "correct": "inverting a filter from samples at the pixel rate needs the response between the samples, and amplifies the noise",
+        "correct": "samples at the pixel rate do not tell the line between them, which its inverse needs, and the inverse amplifies the "
+        "noise. Its delay moves all targets alike, and is part of the principal point",
     },
 )

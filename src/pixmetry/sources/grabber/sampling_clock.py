@@ -57,7 +57,8 @@ SOURCE = Source(
     advice="Sample with the camera's pixel clock, or take a digital camera. Otherwise multiply the pitch by f_pixel/f_s, and do not "
     "resample.",
     reasons={
-        "correct": "coordinates are scaled and images are left as they are: the camera's geometry gives the true position",
+        "correct": "it moves points along the rows, and resampling frames would correlate the noise of neighbours. The camera's geometry "
+        "gives the true position: coordinates are scaled instead",
         "propagate": "a known change of coordinates is not an error; the error by aliasing depends on all filters before it",
     },
 )

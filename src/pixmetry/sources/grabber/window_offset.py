@@ -125,7 +125,8 @@ SOURCE = Source(
     advice="Calibrate the principal point with the grabber that measures, and do not change its window. Do not assume the middle of the "
     "stored image.",
     reasons={
-        "correct": "coordinates are shifted and images are left as they are: the camera's geometry gives the true position",
+        "correct": "it changes the numbers of rows and columns and no value. The camera's geometry gives the true position: coordinates "
+        "are shifted instead",
         "propagate": "an offset of whole pixels moves all targets alike: it belongs to the principal point, not to the error of a target",
     },
 )

@@ -10,7 +10,7 @@ from pixmetry.camera.contribution import Contribution, Probe
 from pixmetry.camera.geometry import frame_centre, image_shift, map_contribution
 from pixmetry.camera.light import Pull
 from pixmetry.camera.signal import Kind, Signal
-from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.camera.source import MOVES_POINTS, Parameters, Source, quantity
 from pixmetry.core.random import Stream
 
 NEWTON_STEPS = 6  # always, so that a place does not depend on the others of its window
@@ -87,9 +87,9 @@ SOURCE = Source(
     references=("M. Born, E. Wolf, Principles of Optics, 7th ed. 1999, §1.5 (law of refraction)",),
     advice="Calibrate with the glass in place: K1 includes nearly all of it.",
     reasons={
-        "measure": "coordinates cannot tell it: a plate displaces along the radius by an odd polynomial of the radius, as the lens does; "
-        "light of several wavelengths tells no more, for the index of glass changes by 1 % from 450 nm to 850 nm; "
-        "take its thickness from the sensor's drawing",
-        "correct": "frames are not resampled; positions are corrected instead, by the calibration",
+        "measure": "a plate displaces along the radius by an odd polynomial of the radius, as the lens does: a thicker plate and another "
+        "distortion leave all coordinates the same. Light of several wavelengths tells no more, for the index of glass "
+        "changes by 1 % from 450 nm to 850 nm; take its thickness from the sensor's drawing",
+        "correct": f"{MOVES_POINTS}, by the calibration",
     },
 )

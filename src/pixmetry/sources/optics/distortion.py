@@ -13,7 +13,7 @@ from pixmetry.camera.geometry import frame_centre, image_shift, map_contribution
 from pixmetry.camera.light import Pull
 from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal
-from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.camera.source import MOVES_POINTS, Parameters, Source, quantity
 from pixmetry.core.errors import ParameterError
 from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
@@ -148,6 +148,6 @@ SOURCE = Source(
     advice="Calibrate the camera with targets all over the image, and correct every position.",
     measure=measure,
     reasons={
-        "correct": "frames are not resampled; positions are corrected instead, by the calibration",
+        "correct": f"{MOVES_POINTS}, by the calibration",
     },
 )

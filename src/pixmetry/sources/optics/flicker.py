@@ -11,7 +11,7 @@ import numpy as np
 from pixmetry.camera.light import Light
 from pixmetry.camera.observations import Observations, of_pictures
 from pixmetry.camera.signal import Kind, Signal
-from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.camera.source import Parameters, Source, cut_rows, quantity
 from pixmetry.core.arrays import Array
 from pixmetry.core.errors import MeasureError
 from pixmetry.core.number import Estimates
@@ -130,6 +130,14 @@ def measure(observations: Observations) -> Estimates:
     return told
 
 
+def correct(params: Flicker, signal: Signal, maps: Mapping[str, np.ndarray]) -> Signal:
+    """Divide the rows of each frame by their light against the mean of all, as the parts of the scene that do not change tell it.
+
+    ``maps["factor_rel"]`` has shape (n, rows of the frame). Of a lamp that makes bands the sine is taken out.
+    """
+    return signal.with_data(signal.data / cut_rows(maps, "factor_rel", signal)[:, :, None])
+
+
 def truth(params: Flicker, signal: Signal, stream: Stream) -> Mapping[str, np.ndarray]:
     """The lamp's light over the exposure of a shutter that opens for all rows at once, shape (n, rows)."""
     level = mean_light(params, signal.time_s, signal.time_s + signal.exposure_s)
@@ -150,13 +158,14 @@ SOURCE = Source(
     forward=forward,
     truth=truth,
     measure=measure,
+    correct=correct,
     gum_class="F",
     equation="E(t) = 1 + d cos(2π f t + φ);  over an exposure d sinc(f t_exp) cos(2π f t_mid + φ), t_mid of each row",
     typical_size="none at 10 ms and 100 Hz; at 1 ms nearly the full modulation of the lamp, in bands with a period of 1/(f t_row) rows",
     references=("IEEE 1789-2015 (modulation of the light of diodes)",),
+    leaves="the noise of each frame's factor; of bands the harmonics of a lamp that is switched, and those of two fields in one frame",
     advice="Use direct current, or expose for a whole number of the light's periods.",
     reasons={
-        "correct": "needs the lamp's phase in every frame: divide rows by their means if the scene is known",
         "propagate": "needs the row times of the camera, which the probe does not contain; a common factor moves no centre",
     },
 )

@@ -11,7 +11,7 @@ from pixmetry.camera.geometry import frame_centre, image_shift, map_contribution
 from pixmetry.camera.light import Pull
 from pixmetry.camera.observations import Observations, of_pictures
 from pixmetry.camera.signal import Kind, Signal
-from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.camera.source import MOVES_POINTS, Parameters, Source, quantity
 from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 
@@ -88,6 +88,6 @@ SOURCE = Source(
     references=("ISO 19084:2015 (chromatic displacement)",),
     advice="Calibrate and measure under the same narrow-band light.",
     reasons={
-        "correct": "frames are not resampled; positions are corrected instead",
+        "correct": f"{MOVES_POINTS}, by a calibration in the light of the measurement",
     },
 )

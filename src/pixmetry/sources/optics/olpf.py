@@ -66,7 +66,8 @@ SOURCE = Source(
     references=("J. E. Greivenkamp, Color dependent optical prefilter, Applied Optics 29 (1990) 676–684", "ISO 12233:2023 (SFR)"),
     advice="If targets are sharper than about 0.5 px and less than 3 px wide: add such a filter, defocus slightly, or stop down.",
     reasons={
-        "correct": "a symmetric spread moves no centre; frames are not deconvolved",
+        "correct": "it spreads light alike to both sides, which moves no centre. What it takes from the highest frequencies is below the "
+        "noise, and a deconvolution would amplify that",
         "propagate": "it only changes the undersampling; that needs the spread in front of the plate, which the probe does not contain",
     },
 )

@@ -181,7 +181,8 @@ SOURCE = Source(
     ),
     advice="If targets are only a few pixels wide: stop down until λN is at least the pixel pitch, or defocus slightly.",
     reasons={
-        "correct": "frames are not deconvolved; a symmetric spread moves no centre",
+        "correct": "an even spread moves no centre. What it takes from the highest frequencies is below the noise, and a deconvolution "
+        "would amplify that",
         "propagate": "it only changes the undersampling; that needs the target before the spread, which the probe does not contain",
     },
 )

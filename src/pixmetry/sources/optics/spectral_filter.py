@@ -126,7 +126,8 @@ SOURCE = Source(
     references=("EMVA 1288 R4.0 Linear, §9 (spectral sensitivity)", "M. A. Green, Solar Energy Mat. & Solar Cells 92 (2008) 1305–1310"),
     advice="Match the filter's band to the light, and focus the lens with the filter in place.",
     reasons={
-        "correct": "lost light cannot be recovered",
+        "correct": "light that did not pass is in no value of the frame. The blur and the shift of the focus that the plate brings are "
+        "part of the lens that is calibrated with it",
         "propagate": "it shifts no target by itself: less light counts in the shot noise, a wider spread in the sampling",
     },
 )

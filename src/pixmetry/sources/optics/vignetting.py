@@ -65,7 +65,8 @@ SOURCE = Source(
     leaves="the noise of the corners, raised with the signal",
     advice="Stop the lens down, take a lens with a longer focal length, or divide by a flat field.",
     reasons={
-        "measure": "a flat field shows the product of all fall-off, which optics.shading measures: that of the lens and that of the "
-        "microlenses are both smooth functions of the radius, and no flat field tells which made it",
+        "measure": "a flat field shows the product of all fall-off, which optics.shading measures: less of the lens and more of the "
+        "microlenses, both smooth functions of the radius, leaves all frames the same. Nothing that frames need is lost by "
+        "that, for shading corrects the product",
     },
 )

@@ -96,6 +96,7 @@ SOURCE = Source(
     references=("EMVA 1288 R4.0 Linear, §2.2 (quantisation, step²/12)", "GenICam PFNC 2.4 (Mono8, Mono12)"),
     advice="Use the raw 10 or 12 bits. Otherwise keep the steps smaller than the noise.",
     reasons={
-        "correct": "values that rounding merged cannot be separated again",
+        "correct": "values that the table rounds to one entry give the same code: what was merged cannot be separated again. The scale "
+        "of the codes is straight, so that nothing else is to be undone",
     },
 )

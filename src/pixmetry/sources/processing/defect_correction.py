@@ -102,7 +102,8 @@ SOURCE = Source(
     references=("EMVA 1288 R4.0 Linear, §8.5 (defect pixels)",),
     advice="Switch it off, or let it replace only listed defects. Use targets of 3 px or more.",
     reasons={
-        "correct": "the replaced values are lost",
+        "correct": "the values that were replaced are not in the frame: whatever they were, it is the same. Switch the correction off in "
+        "the camera, and use sensor.defects",
         "propagate": "the noise decides which pixels are replaced: only a simulation with the camera's noise gives the contribution",
     },
 )

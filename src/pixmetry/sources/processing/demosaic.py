@@ -122,6 +122,7 @@ SOURCE = Source(
     ),
     advice="Store the raw mosaic, balance its colours, and locate targets in it. Use targets of 7 px or more.",
     reasons={
-        "correct": "the raw mosaic is lost, except at the pixels of the colour that is stored",
+        "correct": "of the two colours that were not measured at a pixel nothing is in the frame, and the filter has mixed those of its "
+        "neighbours. Take raw frames; the pixels of the stored colour are as they were",
     },
 )

@@ -105,7 +105,8 @@ SOURCE = Source(
     ),
     advice="Switch it off; average frames instead.",
     reasons={
-        "correct": "medians and weights that depend on the grey values have no inverse",
+        "correct": "different images give one output: a median keeps the middle value alone, and weights that depend on grey values are "
+        "lost with these values. Switch it off in the camera",
         "propagate": "its effect on an edge depends on the noise there: only a simulation with the camera's noise gives the contribution",
     },
 )

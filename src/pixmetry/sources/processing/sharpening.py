@@ -118,6 +118,7 @@ SOURCE = Source(
     references=("R. C. Gonzalez, R. E. Woods, Digital Image Processing, 4th ed., Pearson 2018, §3.6 (unsharp masking)", "ISO 12233:2023"),
     advice="Switch it off.",
     reasons={
-        "correct": "codes cut off at the ends of the range are lost; the others would need a deconvolution without amplified noise",
+        "correct": "codes that it pushed beyond the ends of the range are cut off, and many images give these. The others would need a "
+        "deconvolution, which a symmetric filter does not need for its centres",
     },
 )

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from pixmetry.camera.noise_covariance import frame_correlation
 from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
-from pixmetry.core.errors import MeasureError
+from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.number import ONE_SIDED_95, Estimates
 from pixmetry.core.random import Stream
 from pixmetry.sources.processing._codes import bits_of_camera, stored
@@ -74,6 +76,23 @@ def measure(observations: Observations) -> Estimates:
     return Estimates.from_rows([row], method=METHOD, confounders=CONFOUNDERS, limits=frozenset({"alpha"}), reasons=why)
 
 
+def correct(params: TemporalNoiseReduction, signal: Signal, maps: Mapping[str, np.ndarray]) -> Signal:
+    """Take off each frame the share of the one before, as it was put out: x = (y − α y_before)/(1 − α).
+
+    Raises
+    ------
+    InputError
+        If the signal holds no successive frames.
+    """
+    numbers = signal.grid.frame
+    if len(signal) < 2 or np.any(np.diff(numbers) != 1):
+        raise InputError("needs the frame before", remedy="give frames that were taken without a pause, and say so (--sequence)")
+    out = signal.data.astype(np.float32)  # of the first frame the one before is not known: it stays as it is
+    out[1:] -= np.float32(params.alpha) * signal.data[:-1]
+    out[1:] /= np.float32(1 - params.alpha)
+    return signal.with_data(out)
+
+
 SOURCE = Source(
     id="processing.temporal_noise_reduction",
     title="Temporal noise reduction",
@@ -87,15 +106,16 @@ SOURCE = Source(
     bound=TemporalNoiseReduction(alpha=0.8),
     forward=forward,
     measure=measure,
+    correct=correct,
     start=start,
     option="noise reduction in the camera",
     gum_class="O",
     equation="y(t) = α y(t − 1) + (1 − α) x(t);  noise √((1 − α)/(1 + α));  lag v α/(1 − α) T_f",
     typical_size="motion of one frame at α = 0.5; of four frames at 0.8",
     references=("A. V. Oppenheim, R. W. Schafer, Discrete-Time Signal Processing, Pearson 2010, §5.1 (group delay of a recursive filter)",),
+    leaves="the rounding, enlarged by √(1 + α²)/(1 − α), the noise that the camera's own rounding adds, and the first frame of a sequence",
     advice="Switch it off. Average frames afterwards, with the known motion.",
     reasons={
         "propagate": "a target at rest is not shifted; the shift of a moving one, v α/(1 − α) T_f, needs its speed, which the probe lacks",
-        "correct": "x = (y − α y_before)/(1 − α) needs the whole sequence without a gap",
     },
 )

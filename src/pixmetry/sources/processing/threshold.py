@@ -36,8 +36,8 @@ SOURCE = Source(
     advice="Set the threshold three standard deviations above the background and subtract it (soft threshold).",
     reasons={
         "forward": "it acts in the estimator, not on the frame",
-        "measure": "it acts in the estimator: propagate evaluates it there",
-        "correct": "it acts in the estimator: choose a soft threshold, or fit a model of the target",
+        "measure": "it acts in the estimator, and no frame holds it. The budget evaluates it there",
+        "correct": "it acts in the estimator and not on frames. Choose a soft threshold, or fit a model of the target",
         "neutral": "every estimator works on pixels",
     },
 )

@@ -104,6 +104,7 @@ SOURCE = Source(
     advice="Open the lens, take light of low coherence, move the surface or a diffuser, and average frames with different speckle.",
     reasons={
         "forward": "it belongs to the scene: a `spot` in a scene file is a laser spot with speckle",
-        "correct": "the grains cannot be told from the spot; frames with different speckle can be averaged",
+        "correct": "the same values come from another spot with other grains: what is grain and what is spot is not in the frame. Frames "
+        "with different speckle can be averaged",
     },
 )

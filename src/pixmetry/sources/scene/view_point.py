@@ -90,7 +90,7 @@ SOURCE = Source(
     advice="Light targets from the camera or diffusely, take retro-reflective targets, and fit their edges, not their brightness.",
     reasons={
         "forward": "it belongs to the scene: `lighting` in a scene file makes a gradient, a `plate` is seen in perspective",
-        "correct": "the eccentricity is corrected where positions are adjusted; the template fits the gradient with the target "
-        "(planes=True of pixmetry.locate)",
+        "correct": "a tilted circle and an ellipse seen square on give the same frame. The eccentricity is corrected where positions are "
+        "adjusted, and the template fits the slope of the light with the target (planes=True of pixmetry.locate)",
     },
 )

@@ -22,6 +22,7 @@ from pixmetry.sources.sensor._readout_kernels import spill
 
 UNLIMITED_E = 1e9
 SIGNIFICANT = 3.3
+NEEDED = 2.0  # times by which χ² grows without a parameter that the streaks need, whatever its u
 LEAST_STREAKS = 6  # columns and exposures with a streak
 LEAST_WELLS = 0.5  # of charge that left a spot in a column, for a streak
 METHOD = "charge above and below overexposed spots, fitted by the spilling of their light"
@@ -90,10 +91,7 @@ def measure(observations: Observations) -> Estimates:
     if spots.streaks is None:
         what = "no streak of a spot that is alone in its columns ends within the frame"
         raise MeasureError(what, where="sensor.blooming", remedy="put the spots in the middle of the frame; add exposures of 2 to 5 times")
-    found = _fitted(spots, spots.streaks)
-    scaled = [name in ("full_well_dn", "drain_ratio") for name in found.names]  # by the light, as measured far below saturation
-    bend = np.where(scaled, observations.bend_rel(spots.plateau_dn), 0.0) * found.values
-    found = replace(found, covariance=found.covariance + np.diag(bend**2))
+    found = _with_bend(_fitted(spots, spots.streaks), spots, observations.bend_rel(spots.plateau_dn))
     fit = observations.photon_transfer_fit
     if "full_well_dn" not in found:
         return found
@@ -107,6 +105,23 @@ def measure(observations: Observations) -> Estimates:
     covariance[at, at] += (found.values[at] * gain.u / gain.value**2) ** 2
     units = tuple("e-" if n == "full_well_e" else u for n, u in zip(names, found.units, strict=True))
     return replace(found, names=names, values=found.values * scale, covariance=covariance, units=units)
+
+
+def _with_bend(found: Estimates, spots: BrightSpots, bend_rel: float) -> Estimates:
+    """With what a bent response does in u: the light of far below saturation is then that of a full well so much higher or lower."""
+    if not bend_rel or spots.streaks is None:
+        return found
+    other = spots if spots.clipped else replace(spots, plateau_dn=spots.plateau_dn * (1 + bend_rel))
+    light = replace(spots.streaks, light_dn=spots.streaks.light_dn * (1 + bend_rel)) if spots.clipped else spots.streaks
+    try:
+        moved = _fitted(other, light)
+    except MeasureError:
+        moved = found
+    change = np.where([name in ("full_well_dn", "drain_ratio") for name in found.names], bend_rel, 0.0) * found.values
+    if moved.names == found.names:
+        own = moved.values - found.values
+        change = np.where(np.abs(own) > np.abs(change), own, change)
+    return replace(found, covariance=found.covariance + np.outer(change, change))
 
 
 def _spilled_sums(values: np.ndarray, spots: BrightSpots, streaks: SpotStreaks, factor: np.ndarray) -> np.ndarray:
@@ -174,7 +189,7 @@ def _least_squares(spots: BrightSpots, streaks: SpotStreaks) -> Estimates:
         off = observed - _spilled_sums(values, spots, streaks, factor[place])
         return float((weight * off**2).sum() + (((factor - 1) / prior) ** 2).sum())
 
-    def solved(values: np.ndarray, free: list[int]) -> tuple[np.ndarray, np.ndarray, float]:
+    def solved(values: np.ndarray, free: list[int]) -> tuple[np.ndarray, np.ndarray, float, float]:
         factor, best = np.ones(columns), np.inf
         covariance, dof = np.eye(len(free)), 1.0
         best = chi2_of(values, factor)
@@ -220,7 +235,7 @@ def _least_squares(spots: BrightSpots, streaks: SpotStreaks) -> Estimates:
             values, factor, best = trial, factor + size * step_o, new
             if done:
                 break
-        return values, covariance, dof
+        return values, covariance, dof, best
 
     ups = np.linspace(0.05, 0.95, 19)
     one = np.ones(columns)
@@ -232,20 +247,24 @@ def _least_squares(spots: BrightSpots, streaks: SpotStreaks) -> Estimates:
     neutral = np.array([np.nan, np.nan, 0.0, 1.0])
     reasons: dict[str, str] = {}
     widest = np.zeros(4)  # what is left out as not needed is not known to be none: the others keep the u that they have beside it
+    found, covariance, dof, least = solved(values, free)
     while True:
-        found, covariance, dof = solved(values, free)
         u = np.sqrt(np.diag(covariance))
         widest[free] = np.maximum(widest[free], u)
-        wider = widest[free] / np.maximum(u, 1e-30)
-        covariance, u = covariance * np.outer(wider, wider), widest[free]
-        small = [i for k, i in enumerate(free) if np.isfinite(neutral[i]) and abs(found[i] - neutral[i]) < SIGNIFICANT * u[k]]
-        if not small:
+        small = [i for i in free if np.isfinite(neutral[i]) and abs(found[i] - neutral[i]) < SIGNIFICANT * widest[i]]
+        for gone in sorted(small, key=lambda i: abs(found[i] - neutral[i]) / widest[i]):
+            values = found.copy()
+            values[gone] = neutral[gone]
+            fewer = solved(values, [i for i in free if i != gone])
+            if fewer[3] < NEEDED * max(least, observed.size):  # two that hide each other are not both left out
+                reasons[names[gone]] = f"none is needed: {found[gone]:.3g} ± {widest[gone]:.2g}"
+                free = [i for i in free if i != gone]
+                found, covariance, dof, least = fewer
+                break
+        else:
             break
-        gone = min(small, key=lambda i: abs(found[i] - neutral[i]) / u[free.index(i)])
-        reasons[names[gone]] = f"none is needed: {found[gone]:.3g} ± {u[free.index(gone)]:.2g}"
-        values = found.copy()
-        values[gone] = neutral[gone]
-        free = [i for i in free if i != gone]
+    wider = widest[free] / np.maximum(u, 1e-30)
+    covariance = covariance * np.outer(wider, wider)
     used = [0, *free] if 0 not in free else free
     whole = np.zeros((len(used), len(used)))
     at = [used.index(i) for i in free]
@@ -294,6 +313,7 @@ SOURCE = Source(
     ),
     advice="Lower the exposure until the target peaks at 80 % of the full well; drop targets with streaks.",
     reasons={
-        "correct": "the original positions of the charge are lost: flag the columns, or fit full pixels as 'at least the full well'",
+        "correct": "charges that left a pixel and those that a neighbour gave it add to one value: any two original images with the same "
+        "sums along a column give this frame. Flag the columns, or fit full pixels as 'at least the full well'",
     },
 )

@@ -105,8 +105,10 @@ SOURCE = Source(
     references=("J. R. Janesick, Scientific Charge-Coupled Devices, SPIE Press 2001, ch. 6 (reset noise, double sampling)",),
     advice="Use correlated double sampling and a slow clock; subtract a dark frame for the pattern of the clock.",
     reasons={
-        "measure": "dark frames give the sum of its noise and the amplifier's: both are white in space and time, with "
-        "and without double sampling, so one clock rate does not tell them apart; the fixed pattern of its clock is part of the DSNU",
-        "correct": "noise cannot be removed from a single frame; the dark frame that sensor.dsnu subtracts removes the pattern",
+        "measure": "dark frames give the sum of its noise and the amplifier's: both are white in space and time, with and without double "
+        "sampling, and less of one with more of the other leaves all frames alike. Frames at one clock rate do not tell them "
+        "apart; the fixed pattern of its clock is part of the DSNU",
+        "correct": "a frame with other noise and another scene has the same values: noise cannot be removed from a single frame. The "
+        "dark frame that sensor.dsnu subtracts removes its pattern",
     },
 )

@@ -154,5 +154,8 @@ SOURCE = Source(
     typical_size="below 0.001 px at video exposure times; 300 e- raise 1.40 DN of noise to 1.41 DN at 0.0097 DN/e-",
     references=("EMVA 1288 R4.0 Linear, §7", "J. R. Janesick, Photon Transfer, SPIE Press 2007 (doubling temperature)"),
     advice="Cool the camera, or expose for a shorter time with more light; subtract a dark frame of the same time and temperature.",
-    reasons={"correct": "the dark frame that sensor.dsnu subtracts removes its mean; its shot noise cannot be removed"},
+    reasons={
+        "correct": "its shot noise adds to that of the light, and one value does not tell the two. Its mean is removed by the dark frame "
+        "that sensor.dsnu subtracts"
+    },
 )

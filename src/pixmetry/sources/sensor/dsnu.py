@@ -47,6 +47,8 @@ def truth(params: Dsnu, signal: Signal, stream: Stream) -> Mapping[str, np.ndarr
 def measure(observations: Observations) -> Estimates:
     """Read the split of the dark stack and divide by the gain; u by JCGM 102 (6.2.1.3), gain and split taken as independent."""
     spatial, transfer = observations.spatial_fit, observations.photon_transfer_fit
+    if spatial is not None and "dsnu_pixel_dn" in spatial.reasons and "dsnu_pixel_dn" not in spatial:
+        raise MeasureError(spatial.reasons["dsnu_pixel_dn"], where="sensor.dsnu", remedy="switch off every filter in the camera")
     if spatial is None or "dsnu_pixel_dn" not in spatial:
         raise MeasureError(
             "DSNU needs a stack of dark frames and one of bright frames", where="sensor.dsnu", remedy="take at least 16 of each"

@@ -148,7 +148,8 @@ SOURCE = Source(
     ),
     advice="Use a shorter exposure or a strobe, and assign the position to the mean time of the light.",
     reasons={
-        "correct": "not needed for a centre: report the mean time of the light; the blur itself needs the target's path",
+        "correct": "a target at rest and one that moves give the same frame if its shape is free: the blur needs the target's path. A "
+        "centre needs no correction: report the mean time of the light",
         "propagate": "needs the target's speed and acceleration, which the probe does not contain",
     },
 )

@@ -117,5 +117,7 @@ SOURCE = Source(
     typical_size="below 0.005 px for a target 1.5 × over the full well, without blooming",
     references=("EMVA 1288 R4.0 Linear, §6.6", "J. R. Janesick, Photon Transfer, SPIE Press 2007, ch. 5"),
     advice="Lower the exposure until the target peaks at 80 % of saturation.",
-    reasons={"correct": "the electrons are lost: flag saturated pixels, or fit them as 'at least the full well'"},
+    reasons={
+        "correct": "all signals above the full well give the same value. Flag saturated pixels, or fit them as 'at least the full well'"
+    },
 )

@@ -12,7 +12,7 @@ from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
 from pixmetry.core.arrays import Singles
 from pixmetry.core.errors import InputError, MeasureError
-from pixmetry.core.number import Estimates
+from pixmetry.core.number import Estimates, Number
 from pixmetry.core.random import Grid, Stream
 
 LEAST_LEVELS, LEAST_RANGE = 5, 5.0  # levels of light, and their ratio, that tell a pocket from a share
@@ -96,7 +96,7 @@ def measure(observations: Observations) -> Estimates:
     )
     gain = observations.photon_transfer_fit
     known = gain is not None and "gain_dn_per_e" in gain
-    pocket = _with_pocket(steps, gain["gain_dn_per_e"].value) if known and steps is not None and gain is not None else None
+    pocket = _with_pocket(steps, gain["gain_dn_per_e"]) if known and steps is not None and gain is not None else None
     if pocket is not None:
         return pocket
     if not fit.limits:
@@ -107,16 +107,19 @@ def measure(observations: Observations) -> Estimates:
     return fit
 
 
-def _with_pocket(steps: LightSteps, gain_dn_per_e: float) -> Estimates | None:
-    """Share and pocket fitted together; None where the frames need no pocket, or have too few levels of light."""
+def _with_pocket(steps: LightSteps, gain: Number) -> Estimates | None:
+    """Share and pocket fitted together; None where the frames need no pocket, or have too few levels of light.
+
+    Both charges of the pocket go as one over the gain: u holds that of the gain in DN/e-.
+    """
     from scipy.linalg import block_diag
     from scipy.optimize import least_squares
 
-    signal = np.concatenate([s.levels_dn for s in steps.steps]) / gain_dn_per_e
-    left = np.concatenate([s.left_dn for s in steps.steps]) / gain_dn_per_e
+    signal = np.concatenate([s.levels_dn for s in steps.steps]) / gain.value
+    left = np.concatenate([s.left_dn for s in steps.steps]) / gain.value
     if "left_rel" not in steps.fit or signal.size < LEAST_LEVELS or np.ptp(np.log(signal)) < np.log(LEAST_RANGE):
         return None
-    root = np.linalg.cholesky(block_diag(*(s.left_covariance_dn2 for s in steps.steps)) / gain_dn_per_e**2)
+    root = np.linalg.cholesky(block_diag(*(s.left_covariance_dn2 for s in steps.steps)) / gain.value**2)
 
     def residuals(values: np.ndarray) -> np.ndarray:
         share, filled, fill = values  # a pocket cannot hold more than the charge that comes: p ≤ p0
@@ -141,7 +144,8 @@ def _with_pocket(steps: LightSteps, gain_dn_per_e: float) -> Estimates | None:
     names, units = ("lag_rel", "pocket_e", "pocket_fill_e"), ("1", "e-", "e-")
     dof = np.full(3, float(max(signal.size - 3, 1)))
     method = f"{steps.fit.method}; share and pocket fitted to {signal.size} levels of light"
-    values, covariance = np.array([share, filled * fill, fill]), slopes @ covariance @ slopes.T
+    by_gain = np.array([0.0, filled * fill, fill]) * gain.u / gain.value
+    values, covariance = np.array([share, filled * fill, fill]), slopes @ covariance @ slopes.T + np.outer(by_gain, by_gain)
     return Estimates(names, values, covariance, dof, units, method=method, confounders=steps.fit.confounders)
 
 

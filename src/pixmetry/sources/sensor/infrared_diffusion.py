@@ -156,7 +156,8 @@ SOURCE = Source(
     ),
     advice="Put an infrared-cut filter in front of the sensor, or use light below 650 nm.",
     reasons={
-        "correct": "frames are not deconvolved; the outward shift is part of the calibrated distortion",
+        "correct": "it spreads charge alike to all sides, which moves no centre, and a deconvolution would amplify the noise. Its "
+        "outward shift is part of the calibrated distortion",
         "propagate": "it changes the sampling of the target; that needs the target before the spread, which the probe does not contain",
     },
 )

@@ -99,7 +99,8 @@ SOURCE = Source(
     advice="Use a progressive camera. Or locate targets in each field separately, at the time of that field. Or use one flash for both "
     "fields.",
     reasons={
-        "correct": "needs the speed of every target; locate targets in each field separately instead",
+        "correct": "a target that is displaced between the fields and one of another shape give the same frame: the correction needs the "
+        "speed of every target. Locate targets in each field separately instead; `pixmetry corrected` takes speeds",
         "propagate": "needs the target's speed, which the probe does not contain; the time of the frame is wrong by up to half a field",
     },
 )

@@ -88,7 +88,8 @@ SOURCE = Source(
     references=("M. Raffel et al., Particle Image Velocimetry, Springer 2018 (two pulses astride the transfer)",),
     advice="Place the pulses as close together as the field transfer allows. Block steady light by a filter for the colour of the pulses.",
     reasons={
-        "correct": "needs the speed of every target; locate targets in each field separately instead",
+        "correct": "a target that is displaced between the pulses and one of another shape give the same frame: the correction needs the "
+        "speed of every target. Locate targets in each field separately instead",
         "propagate": "needs the target's speed, which the probe does not contain",
     },
 )

@@ -152,7 +152,8 @@ SOURCE = Source(
     ),
     advice="Calibrate a, b and c of every pixel at four uniform levels or more, and invert the response before measuring.",
     reasons={
-        "correct": "needs the maps of a, b and c of this camera, which dark and flat stacks at one level do not show",
+        "correct": "each pixel has a curve of its own, whose offset, slope and foot dark and flat stacks at one level do not show. It "
+        "needs maps of all three, from flat fields over decades of light",
         "neutral": "it is a conversion: without it there is no digital signal",
     },
 )

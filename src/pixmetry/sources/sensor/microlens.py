@@ -50,7 +50,8 @@ SOURCE = Source(
     leaves="the noise of the corners, raised with the signal",
     advice="Use a lens with an exit pupil that matches the sensor. Calibrate and take flat fields at the working aperture.",
     reasons={
-        "measure": "a flat field shows the product of all fall-off, which optics.shading measures: both this one and the lens's are smooth "
-        "functions of the radius; the part that changes with the f-number is no proof either, as the lens's changes with it too",
+        "measure": "a flat field shows the product of all fall-off, which optics.shading measures: more of this one and less of the "
+        "lens's, both smooth functions of the radius, leaves all frames the same. The part that changes with the f-number is "
+        "no proof either, as the lens's changes with it too",
     },
 )

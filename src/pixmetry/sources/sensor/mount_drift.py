@@ -10,7 +10,7 @@ from pixmetry.camera.geometry import frame_centre, image_shift
 from pixmetry.camera.light import Pull
 from pixmetry.camera.observations import Observations, of_pictures
 from pixmetry.camera.signal import Kind, Signal
-from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.camera.source import MOVES_POINTS, Parameters, Source, quantity
 from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 
@@ -111,7 +111,7 @@ SOURCE = Source(
     ),
     advice="Wait until the camera is warm. Clamp the lens. Calibrate in the orientation in which you measure.",
     reasons={
-        "correct": "frames are not resampled; positions are corrected instead, from the time or the temperature",
+        "correct": f"{MOVES_POINTS}, from the time or the temperature",
         "propagate": "it depends on the time of the frame, which the probe does not contain",
     },
 )

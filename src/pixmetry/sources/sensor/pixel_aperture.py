@@ -79,10 +79,14 @@ SOURCE = Source(
     gum_class="F",
     equation="s = I ∗ box(a_x, a_y) at the pixel;  MTF = |sinc(a ν)|;  periodic error a₁ = |H'(1)|/(π H(0))",
     typical_size="a Gaussian spot of σ = 0.4 px: 0.014 px at full fill, 0.07 px at a width of 0.4",
-    references=("S. K. Park, R. Schowengerdt, M.-A. Kaczynski, MTF for sampled imaging systems, Applied Optics 23 (1984) 2572–2582",),
+    references=(
+        "S. K. Park, R. Schowengerdt, M.-A. Kaczynski, Modulation-transfer-function analysis for sampled image systems, "
+        "Applied Optics 23 (1984) 2572–2582",
+    ),
     advice="Widen the target's image to a spread of 0.6 px or more, or take a sensor with microlenses.",
     reasons={
-        "correct": "light between the pixels is not recorded; shifted frames can be interleaved instead",
+        "correct": "light between the sensitive areas is recorded nowhere: images that differ there alone give the same frame. Frames "
+        "that are shifted by parts of a pixel can be interleaved instead",
         "propagate": "it only changes the undersampling; that needs the spread in front of the pixel, which the probe does not contain",
     },
 )

@@ -11,7 +11,7 @@ from pixmetry.camera.geometry import image_shift
 from pixmetry.camera.light import Pull
 from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal
-from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.camera.source import MOVES_POINTS, Parameters, Source, quantity
 from pixmetry.core.number import Estimates
 from pixmetry.core.random import Grid, Stream
 
@@ -107,6 +107,6 @@ SOURCE = Source(
     advice="Usually nothing: it is far smaller than other errors. Keep targets away from the seams of a stitched sensor.",
     measure=measure,
     reasons={
-        "correct": "frames are not resampled; positions are corrected instead, by a map of the residuals",
+        "correct": f"{MOVES_POINTS}, by a map of the residuals of a calibration",
     },
 )

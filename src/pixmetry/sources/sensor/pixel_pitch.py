@@ -71,8 +71,8 @@ SOURCE = Source(
     references=("J. G. Fryer, Camera calibration, in Atkinson (ed.), Close Range Photogrammetry and Machine Vision, 1996",),
     advice="Take both pitches from the data sheet, and let the calibration estimate the ratio of the scales.",
     reasons={
-        "measure": "images depend on pitch over principal distance alone, so that no image tells the size of a pitch; a calibration gives "
-        "the ratio of both pitches as affinity",
-        "correct": "frames are not resampled; positions are multiplied by the true pitch instead",
+        "measure": "images depend on pitch over principal distance alone: twice the pitch and twice the distance leave all frames the "
+        "same, so that no image tells the size of a pitch. A calibration gives the ratio of both pitches as affinity",
+        "correct": "it changes no value of a frame, only what a pixel is in mm. Positions are multiplied by the true pitch instead",
     },
 )

@@ -85,7 +85,7 @@ SOURCE = Source(
     references=("EMVA 1288 R4.0 Linear, §2.1 and §6", "M. A. Green, Sol. Energ. Mat. Sol. Cells 92, 1305, 2008 (absorption of silicon)"),
     advice="Use light at a wavelength where the sensor is sensitive and the lens is corrected.",
     reasons={
-        "correct": "a common factor is not an error of the image; lost light cannot be recovered",
+        "correct": "a factor common to all pixels is no error of the image. Light that made no electron is in no value of the frame",
         "propagate": "it scales the signal of all pixels alike and moves no target; its effect on the noise is in sensor.shot_noise",
         "neutral": "it is a conversion: without it there are no electrons",
     },

@@ -131,7 +131,8 @@ SOURCE = Source(
     ),
     advice="Use whole frames. If there are only fields, sum the lines, and check the order of the fields on a slanted edge.",
     reasons={
-        "correct": "rows swapped are swapped back by the same source; rows of the other field are not in the frame",
+        "correct": "rows of the other field are not in the frame: any values there give the same one. Rows that are swapped are swapped "
+        "back by the same source",
         "propagate": "needs the target on the raster of the field; the probe has it on the raster of the frame",
     },
 )

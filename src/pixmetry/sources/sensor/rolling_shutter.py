@@ -77,7 +77,8 @@ SOURCE = Source(
     references=("C. Geyer, M. Meingast, S. Sastry, OMNIVIS 2005 (geometric models of rolling shutters)",),
     advice="Use a global shutter, or a strobe after a global reset. Otherwise model the time of every row.",
     reasons={
-        "correct": "needs the speed of every target: a target at row r belongs to the time of that row",
+        "correct": "a target at row r belongs to the time of that row, so the correction needs its speed: a moving target and one of "
+        "another shape give the same frame. `pixmetry corrected` takes speeds",
         "propagate": "needs the target's speed, which the probe does not contain",
     },
 )

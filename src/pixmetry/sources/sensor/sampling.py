@@ -43,8 +43,9 @@ SOURCE = Source(
     advice="Stop the lens down or defocus until a point is seen in two pixels or more; take larger targets.",
     reasons={
         "forward": "it is what pixels are: there is no camera without it",
-        "measure": "it has no parameter of its own: the swing follows from the spread of lens and pixels, which slanted edges measure",
-        "correct": "the swing of a known target can be looked up by its phase; fitting the right template has none",
+        "measure": "it has no parameter of its own. The swing follows from the spread of lens and pixels, which slanted edges measure",
+        "correct": "what lies between the samples is in no value of the frame. Fitting the right template has no swing, and that of a "
+        "known target can be looked up by its phase",
         "neutral": "it has no parameters: nothing of it can be switched off",
     },
 )

@@ -44,8 +44,9 @@ SOURCE = Source(
     references=("EMVA 1288 R4.0 Linear, §2.2", "M. B. Giles, ACM TOMS 42(1), 2016, algorithm 955 (inversion)"),
     advice="Collect more electrons: a brighter target up to 80 % of saturation, a larger target, or N frames (1/√N).",
     reasons={
-        "measure": "it has no free parameter: the gain that scales it is measured by electronics.gain from the photon transfer",
-        "correct": "shot noise cannot be removed from a single frame; averaging frames lowers it",
+        "measure": "it has no free parameter. The gain that scales it is measured by electronics.gain from the photon transfer",
+        "correct": "a frame with other noise and another scene has the same values: noise cannot be removed from a single frame. "
+        "Averaging frames lowers it",
         "neutral": "all light has it",
     },
 )

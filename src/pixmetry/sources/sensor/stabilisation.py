@@ -11,7 +11,7 @@ from pixmetry.camera.geometry import frame_centre, image_shift
 from pixmetry.camera.light import Pull
 from pixmetry.camera.observations import Observations, of_pictures
 from pixmetry.camera.signal import Kind, Signal
-from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.camera.source import MOVES_POINTS, Parameters, Source, quantity
 from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 
@@ -100,6 +100,6 @@ SOURCE = Source(
     references=("ISO 20954-1:2019 (image stabilisation performance)",),
     advice="Switch the stabilisation off, or estimate principal point and roll for every image.",
     reasons={
-        "correct": "frames are not resampled; positions are corrected instead, by the pose of each frame",
+        "correct": f"{MOVES_POINTS}, by the pose of each frame",
     },
 )

@@ -12,7 +12,7 @@ from pixmetry.camera.geometry import frame_centre, image_shift, map_contribution
 from pixmetry.camera.light import Pull
 from pixmetry.camera.observations import Observations, of_pictures
 from pixmetry.camera.signal import Kind, Signal
-from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.camera.source import MOVES_POINTS, Parameters, Source, quantity
 from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 
@@ -100,6 +100,6 @@ SOURCE = Source(
     advice="Let the camera warm up, keep its temperature constant, and calibrate at the temperature of the measurement.",
     measure=measure,
     reasons={
-        "correct": "frames are not resampled; positions are corrected instead, from the temperature",
+        "correct": f"{MOVES_POINTS}, from the temperature",
     },
 )

@@ -11,7 +11,7 @@ from pixmetry.camera.geometry import frame_centre, image_shift, map_contribution
 from pixmetry.camera.light import Pull
 from pixmetry.camera.observations import Observations, of_pictures
 from pixmetry.camera.signal import Kind, Signal
-from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.camera.source import MOVES_POINTS, Parameters, Source, quantity
 from pixmetry.core.arrays import Array
 from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
@@ -119,6 +119,6 @@ SOURCE = Source(
     advice="Calibrate: principal point and principal distance include nearly all of it. Shim the sensor if one side is out of focus.",
     measure=measure,
     reasons={
-        "correct": "frames are not resampled; positions are corrected instead, by the calibration",
+        "correct": f"{MOVES_POINTS}, by the calibration",
     },
 )

@@ -66,7 +66,8 @@ SOURCE = Source(
     references=("IEEE 1588-2019 (precision time protocol)", "GigE Vision 2.0 (time stamps)"),
     advice="Use a hardware trigger and the time stamp of the camera, not of the computer. Synchronise clocks by PTP.",
     reasons={
-        "correct": "a frame does not contain its delay",
+        "correct": "a frame that is late and a scene that was displaced look the same: a frame does not contain its delay. "
+        "Targets whose path is known tell it, and their speed times the delay is taken off positions",
         "propagate": "needs the target's speed, which the probe does not contain: u = v σ_t",
     },
 )

@@ -12,7 +12,7 @@ from pixmetry.camera.geometry import corner_px, frame_centre, image_shift, map_c
 from pixmetry.camera.light import Pull
 from pixmetry.camera.observations import Observations, of_pictures
 from pixmetry.camera.signal import Kind, Signal
-from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.camera.source import MOVES_POINTS, Parameters, Source, quantity
 from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
 
@@ -136,6 +136,6 @@ SOURCE = Source(
     advice="Measure the surface separately, use a lens that is telecentric on the image side, or roll the camera in the calibration.",
     measure=measure,
     reasons={
-        "correct": "frames are not resampled; positions are corrected instead, from the height map",
+        "correct": f"{MOVES_POINTS}, from the height map",
     },
 )

@@ -131,7 +131,8 @@ SOURCE = Source(
     references=("ITU-T T.81 | ISO/IEC 10918-1, Annexes A and K", "Independent JPEG Group, libjpeg, jcparam.c (scaling of the tables)"),
     advice="Store without loss. If there is no choice, use a quality of at least 95 and large targets.",
     reasons={
-        "correct": "the original coefficients are lost",
+        "correct": "all blocks whose coefficients round to the same multiples give the same file. What was rounded off is lost; store "
+        "without loss",
         "neutral": "even at quality 100 the coefficients are rounded to whole numbers",
     },
 )

@@ -270,6 +270,7 @@ SOURCE = Source(
     ),
     advice="Digitise directly, not from tape. Otherwise play the tape on the recorder that recorded it, through a time-base corrector.",
     reasons={
-        "correct": "needs the shift of every line in the same frame, for instance from a reference line beside the targets",
+        "correct": "a line that the tape shifted and a scene that is shifted there look the same: the correction needs a reference in "
+        "every line of the same frame. With a straight line beside the targets, `pixmetry corrected --per-image rows` takes the jitter off",
     },
 )

@@ -209,7 +209,8 @@ SOURCE = Source(
     ),
     advice="Record without loss (raw, FFV1). If there is no choice: independently coded pictures (group 1), and a quantiser below 12.",
     reasons={
-        "correct": "the rounded values are lost",
+        "correct": "all pictures whose coefficients round to the same multiples give the same stream. What was rounded off is lost; "
+        "store without loss",
         "propagate": "blocks and predictions depend on the whole picture and earlier ones; simulate sequences and locate targets in them",
     },
 )
