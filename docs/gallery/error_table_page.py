@@ -1,4 +1,4 @@
-"""The page of the chapter's error table: its stars and those of its own camera, and the residual that it found after a calibration."""
+"""The page of the chapter's error table: its stars, those of its own camera and of a modern one, and the residual after a calibration."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from pixmetry.budget.camera_budget import CameraBudget
 from pixmetry.budget.handbook import differs, why_differ
 from pixmetry.budget.scenario import read_scenario
 from pixmetry.budget.setting import Setting
-from pixmetry.budget.table import STARS_PX, SourceRow, Table
+from pixmetry.budget.table import ABSENT, STARS_PX, SourceRow, Table
 from pixmetry.camera.camera import load_camera
 from pixmetry.camera.catalogue import sources
 from pixmetry.locate.target_estimator import TargetEstimator
 
 SCENARIO = Path(__file__).with_name("table_3_2.yaml")
-CAMERA, OLDER = "pulnix_tm6cn_epix_pixelclock", "pulnix_tm6cn_epix_512"
+CAMERA, OLDER, MODERN = "pulnix_tm6cn_epix_pixelclock", "pulnix_tm6cn_epix_512", "imx264_like"
 CHAPTER_PX = (1 / 25, 1 / 28)
 ESTIMATOR = "centroid"
 DARK_NOISE_DN, PEAK_DN = 0.9, 150.0  # its Fig 3.20 in the dark, and its Note 13
@@ -42,10 +42,15 @@ chapter's own camera, a Pulnix TM-6CN on an Epix frame grabber, with [`pixmetry 
 ([scenario](../gallery/table_3_2.yaml)).
 "Cold" is the grabber with a clock of 10 MHz of its own and 512 samples in a row, ten minutes after switching on, calibrated when it
 was warm
-(rows of cable and grabber). Stars are by the total before a calibration, from {stars} px on. The chapter's stars are for the worst
-common case; those of a camera are for what it has.
+(rows of cable and grabber). "Modern" is a digital camera with a CMOS sensor of 5 megapixels ([`{modern}`](../cameras.md)) in the
+conditions of the warm one. Stars are by the total before a calibration, from {stars} px on. The chapter's stars are for the worst
+common case; those of a camera are for what it has. An empty place: the camera does not have the source.
 
 {rows}
+After a calibration, a target in one frame has {x:.4f} px in x and {y:.4f} px in y with the chapter's camera, and {modern_x:.4f} and
+{modern_y:.4f} px with the modern one. Largest there: {modern_largest}. Nothing is known of how flat its sensor is, so it counts with a
+usual sensor's unflatness.
+
 Where the stars of the camera with the pixel clock differ by two or more:
 
 {why}
@@ -93,6 +98,12 @@ def chapter_budget() -> CameraBudget:
     return pixmetry.budget(CAMERA, SCENARIO, estimator=ESTIMATOR)
 
 
+@lru_cache(maxsize=1)
+def modern_budget() -> CameraBudget:
+    """The budget of the same target in a camera of today."""
+    return pixmetry.budget(MODERN, SCENARIO, estimator=ESTIMATOR)
+
+
 def items() -> list[Item]:
     """The chapter's numbers."""
     budget = chapter_budget()
@@ -132,15 +143,23 @@ def _text(budget: CameraBudget, rows: Sequence[SourceRow], older: dict[str, Sour
     quiet = stored().levels[0]  # without jitter beyond the camera's own
     line = (quiet.x.rms_px, quiet.y.rms_px)
     single = [np.sqrt(AVERAGED) * v for v in line]
-    counted = [r for r in budget.rows if r.counts][:4]
+    modern = modern_budget()
+    modern_rows = {r.source_id: r for r in modern.rows if r.status != ABSENT}
     return TEXT.format(
         camera=CAMERA,
+        modern=MODERN,
+        modern_x=modern.one.after_px[0],
+        modern_y=modern.one.after_px[1],
+        modern_largest=_largest(modern),
         estimator=ESTIMATOR,
         stars=", ".join(f"{v:g}" for v in STARS_PX),
         rows=table(
-            ["row", "source", "chapter", "pixel clock", "cold", "before / px", "after / px", "cold, before / px"],
-            [_cells(r, older.get(r.source_id)) for r in rows],
-            5,
+            [
+                *("row", "source", "chapter", "pixel clock", "cold", "modern", "before / px", "after / px", "cold, before / px"),
+                *("modern, before / px", "modern, after / px"),
+            ],
+            [_cells(r, older.get(r.source_id), modern_rows.get(r.source_id)) for r in rows],
+            6,
         ),
         why="\n".join(f"- **{r.number} {r.title}.** {why_differ(r)}" for r in rows if differs(r)),
         cx=CHAPTER_PX[0],
@@ -149,7 +168,7 @@ def _text(budget: CameraBudget, rows: Sequence[SourceRow], older: dict[str, Sour
         y=y,
         rx=CHAPTER_PX[0] / x,
         ry=CHAPTER_PX[1] / y,
-        largest=", ".join(f"{r.title} {_px(r.after_px)} px" for r in counted),
+        largest=_largest(budget),
         dark=DARK_NOISE_DN,
         peak=PEAK_DN,
         windows=", ".join(f"{_row_centroid(w):.3f} px for w = {w}" for w in WINDOWS_PX),
@@ -170,9 +189,14 @@ def _row_centroid(window_px: int) -> float:
     return float(DARK_NOISE_DN * np.sqrt(np.sum(x**2)) / (PEAK_DN * 4.5))
 
 
-def _cells(row: SourceRow, cold: SourceRow | None) -> list[object]:
-    stars = (_stars(row.stars), _stars(row.own_stars), "" if cold is None else _stars(cold.own_stars))
-    return [row.number, row.title, *stars, _px(row.before_px), _px(row.after_px), "" if cold is None else _px(cold.before_px)]
+def _largest(budget: CameraBudget) -> str:
+    return ", ".join(f"{r.title} {_px(r.after_px)} px" for r in [r for r in budget.rows if r.counts][:4])
+
+
+def _cells(row: SourceRow, cold: SourceRow | None, modern: SourceRow | None) -> list[object]:
+    stars = (_stars(row.stars), *("" if r is None else _stars(r.own_stars) for r in (row, cold, modern)))
+    values = ("" if cold is None else _px(cold.before_px), *(("", "") if modern is None else (_px(modern.before_px), _px(modern.after_px))))
+    return [row.number, row.title, *stars, _px(row.before_px), _px(row.after_px), *values]
 
 
 def _stars(count: int) -> str:

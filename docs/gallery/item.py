@@ -93,12 +93,14 @@ class Item:
 
 
 def comparison(items: Iterable[Item]) -> str:
-    """The table of a page: chapter, ours, and why they differ."""
-    rows = [[i.id, i.what, *i.numbers, number(i.tolerance), i.verdict_head, i.why] for i in items]
-    head = ["item", "quantity", "expected", "ours", "u", "tolerance", "verdict", "why"]
+    """The table of a page, chapter against ours, and below it the reasons."""
+    items = list(items)
+    rows = [[i.id, i.what, *i.numbers, number(i.tolerance), i.verdict_head] for i in items]
+    head = ["item", "quantity", "expected", "ours", "u", "tolerance", "verdict"]
     lines = table(head, rows, 2).split("\n")
-    lines[1] = "| --- | --- | ---: | ---: | ---: | ---: | --- | --- |"
-    return "\n".join(lines)
+    lines[1] = "| --- | --- | ---: | ---: | ---: | ---: | --- |"
+    reasons = [f"- {i.id}{'' if i.verdict == AGREE else f', {i.verdict_head}'}: {i.why}." for i in items if i.why]
+    return "\n".join([*lines, *(["What is expected, and why they differ:", "", *reasons, ""] if reasons else [])])
 
 
 def number(value: float, digits: int = 6) -> str:

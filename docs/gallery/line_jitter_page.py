@@ -316,8 +316,11 @@ def items() -> list[Item]:
         Item.judged("T3.2d", "0.291 µm in pixels of 8.3 µm", "E", 1 / 28, CHAPTER_UM[1] / 8.3, 0.0007, why="printed: 1/28; it is 1/28.5"),
         Item.judged("N20", "positions on lines in all images", "E", 34560, 2 * LINES * POSITIONS * len(VIEWS), 0, why="8 · 80 · 27 · 2"),
         Item.judged("N26a", "variance along x over that along y, its own residuals in px", "E", 1.0, ratio, 0.25,
-                    otherwise=f"chapter inconsistent: (0.341/8.6)² / (0.291/8.3)² = {ratio:.3f} is above the critical 1.25 (one-sided 5 %, "
-                    "216 degrees of freedom each), so there is evidence, although its cause need not be jitter"),
+                    otherwise=f"differs because the chapter sees no evidence in its numbers, but (0.341/8.6)² / (0.291/8.3)² = "
+                    f"{ratio:.3f}; with one "
+                    "degree of freedom for each line and image (216) the critical value is 1.25 (5 %, one-sided, for jitter can "
+                    "only add to x; "
+                    "1.31 two-sided), with one for each position (17 280) it is 1.03; the cause need not be jitter"),
         Item.judged("N26b", "jitter of 1 ns, measured from the rows of one frame / ns", "V", 1.0, rows.value, 0.05, rows.u,
                     why="expected: as simulated; a grabber's nanoseconds can be seen"),
     ]  # fmt: skip

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from gallery.item import Item, comparison
-from gallery.page import WIDTH_PX, Page
+from gallery.page import WIDTH_PX, Moving, Page
 from pixmetry.core.errors import InputError
 from pixmetry.report.drawing import escape
 from pixmetry.report.numbers import MINUS
@@ -33,7 +33,8 @@ class Note:
     ----------
     name : str
     head : dict
-        Title, chapter, shows, items, figures, and ``slow``: true if it takes more than a second or two.
+        Title, chapter, shows, items, figures, and ``slow``: true if it takes more than a second or two. The tolerance of an item is a
+        number or "3 u".
     body, script : str
     """
 
@@ -65,7 +66,8 @@ class Note:
         told = self.head.get("figures", {})
         if set(told) != set(drawn):
             raise InputError("text and script have other figures", where=self.name, value=sorted(drawn), allowed=str(sorted(told)))
-        return numbers, tuple(Figure(drawn[k], k, *(self._fill(told[k][part], numbers) for part in ("alt", "caption"))) for k in told)
+        kinds = {k: Moving if isinstance(drawn[k], str) else Figure for k in told}
+        return numbers, tuple(kinds[k](drawn[k], k, *(self._fill(told[k][part], numbers) for part in ("alt", "caption"))) for k in told)
 
     @property
     def figures(self) -> list[str]:
@@ -90,7 +92,10 @@ class Note:
         for reason in ("why", "otherwise"):
             if reason in told:
                 told[reason] = self._fill(told[reason], numbers)
-        return Item.judged(**told, ours=numbers[name], u=numbers.get(f"u_{name}", 0.0))
+        u = numbers.get(f"u_{name}", 0.0)
+        if told["tolerance"] == "3 u":  # of what is measured and known exactly
+            told["tolerance"] = float(f"{3 * u:.3g}")
+        return Item.judged(**told, ours=numbers[name], u=u)
 
     def _picture(self, name: str, told: dict[str, str], numbers: dict[str, float]) -> str:
         alt, caption = (self._fill(told[part], numbers) for part in ("alt", "caption"))

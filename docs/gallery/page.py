@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 from pixmetry.report.drawing import escape
 from pixmetry.report.page import Figure
@@ -16,6 +17,17 @@ STYLE = (
     "@media(prefers-color-scheme:dark){svg{--ground:#14171b;--ink:#e8eaed;--soft:#a5adb8;--grid:#333a43;--blue:#5fb3ea;--red:#f4915a;"
     "--amber:#dfb046}}"
 )
+
+
+@dataclass(frozen=True, eq=False)
+class Moving(Figure):
+    """A drawing in motion, as `pixmetry.report.moving.moving_svg` makes it."""
+
+    @cached_property
+    def svg(self) -> str:
+        """Its markup, with the words for those who do not see it."""
+        assert isinstance(self.drawing, str)
+        return self.drawing.replace("<svg", f'<svg role="img" aria-label="{escape(self.alt)}"', 1)
 
 
 @dataclass(frozen=True)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from gallery import error_table_page, line_jitter_page, offset_page, threshold_page
-from gallery.item import KINDS, Item
+from gallery import error_table_page, line_jitter_page, offset_page, questions, threshold_page
+from gallery.chapter import list_of_all
+from gallery.item import KINDS, Item, comparison
 from gallery.note import Note, record_of, stored_numbers
 from gallery.page import Page, table
 
@@ -19,10 +20,17 @@ how a camera shifts the measured position of a target. These pages repeat the ex
 and compare the numbers with those of the chapter. Where the chapter contradicts itself, the page says so and shows the computation.
 
 {pages}
+Change a number and see: [five questions](questions.md), each answered by one number in a script.
+
 All numbers are the same in every run, because the random numbers are keyed. Positions and errors are in pixels. An error is
 measured minus true. Grey values are those of 8 bits.
 
 ## Every figure, table and number
+
+The chapter has 24 figures, 3 tables and 26 numbers. Each is on a page:
+
+{every}
+## The items
 
 Kinds: {kinds}.
 "Expected" is what the chapter prints, or what follows from it or from the simulated camera: the page tells which. A value agrees if it lies
@@ -52,9 +60,10 @@ EXPERIMENTS = {  # pages with modules of their own: where in the chapter, title,
     ),
 }  # fmt: skip
 ORDER = (
-    "error-table", "camera-data", "grabber-warm-up", "sampling-clock", "laser-speckle", "interlace", "gamma", "low-pass", "video-tape",
-    "threshold", "unflatness", "cable", "window-offset", "offset", "camera-filter", "camera-warm-up", "charge-transfer",
-    "amplifier-noise", "quantisation", "line-jitter", "fixed-pattern", "super-resolution", "pixel-places",
+    "camera-data", "interline", "frame-transfer", "error-table", "grabber-warm-up", "sampling-clock", "laser-speckle", "interlace",
+    "gamma", "low-pass", "video-tape", "threshold", "view-point", "unflatness", "cable", "window-offset", "offset", "camera-filter",
+    "spectral-sensitivity", "camera-warm-up", "charge-transfer", "amplifier-noise", "quantisation", "line-jitter", "jitter-cost",
+    "fixed-pattern", "super-resolution", "pixel-places",
 )  # as in the chapter  # fmt: skip
 NOTES = tuple(name for name in ORDER if name not in EXPERIMENTS)
 
@@ -83,8 +92,9 @@ def make_gallery(run: Collection[str] = NOTES) -> Gallery:
     for name in ORDER:
         if name in EXPERIMENTS:
             module, where, title, what = EXPERIMENTS[name]
-            pages[name] = module.page()
-            items += [(name, item) for item in module.items()]
+            own, made = module.items(), module.page()
+            pages[name] = replace(made, text=f"{made.text.rstrip()}\n\n## Chapter, ours, and why they differ\n\n{comparison(own)}")
+            items += [(name, item) for item in own]
         else:
             note = Note.read(name)
             numbers[name], pictures = note.run() if name in run or name not in numbers else (numbers[name], ())
@@ -92,14 +102,18 @@ def make_gallery(run: Collection[str] = NOTES) -> Gallery:
             items += [(name, item) for item in note.items(numbers[name])]
             where, title, what = (note.head[k] for k in ("chapter", "title", "shows"))
         rows.append([where, f"[{title}]({name}.md)", what])
+    asked = questions.NAME
+    numbers[asked] = questions.all_changed() if asked in run or asked not in numbers else numbers[asked]
+    pages[asked] = questions.page(numbers, numbers[asked])
     index = INDEX.format(
         pages=table(["chapter", "page", "what it shows"], rows, 3),
         kinds=", ".join(f"{k}: {v}" for k, v in KINDS.items()),
+        every=list_of_all(items),
         items=_summary(items),
         count=_count([item for _, item in items]),
     )
     found = [item for _, item in items]
-    kept = {name: numbers[name] for name in NOTES}
+    kept = {name: numbers[name] for name in (*NOTES, asked)}
     return Gallery({"index": Page("index", index), **pages}, tuple(found), record_of(found, kept))
 
 

@@ -17,6 +17,7 @@ from pixmetry.camera.chain_order import Element
 from pixmetry.camera.source import STATED_FRAME, Source, bounds_text
 from pixmetry.core.errors import PixmetryError
 from pixmetry.scene.uniform import Uniform
+from site_pages.citations import citation_of
 
 DIGITAL, ANALOGUE = "imx264_like", "pulnix_tm6cn_epix_512"
 SHAPE = (72, 96)  # of the frames in the figures
@@ -80,7 +81,7 @@ def _page(source: Source, figure: str) -> str:
             told += f"; left: {source.leaves}"
         lines.append(f"| {words.get(verb, verb)} | {_cell(told)} |")
     lines += ["", f"```sh\npixmetry sources {source.id}\n```", "", "## References", ""]
-    return "\n".join([*lines, *(f"- {text}" for text in source.references), ""])
+    return "\n".join([*lines, *(f"- {text} ({citation_of(text).words})" for text in source.references), ""])
 
 
 def _cell(text: str) -> str:

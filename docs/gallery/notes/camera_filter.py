@@ -33,6 +33,7 @@ def passed(light_nm):
 
 def run():
     values = {f"peak_{d:.0f}": NM[response(d).argmax()] for d in DEPTHS_UM}
+    values["needed"] = next(d for d in np.arange(5.0, 60.0, 0.5) if NM[response(d).argmax()] >= 750.0)
     values |= {
         "laser": passed(670.0),
         "green": passed(550.0),

@@ -49,6 +49,7 @@ def run():
             axes.loglog(levels * GAIN / 250, 10**at * levels**slope, color=colour)
         axes.set(xlabel="relative exposure", ylabel="grey value above black")
         axes.legend()
+    values["tenth"] = (camera_of(0.45).expose(Uniform(0.1 * 250 / GAIN), 1).data.mean() - 5.0) / 250
     values |= {"ratio": values["soft_045"] / values["soft_1"], "u_ratio": values["soft_045"] / values["soft_1"] / 20}
     values |= {"u_soft_045": values["soft_045"] / np.sqrt(800), "u_soft_1": values["soft_1"] / np.sqrt(800)}
     return values, {"gamma": figure}
