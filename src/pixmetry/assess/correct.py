@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from inspect import getdoc
@@ -777,15 +778,14 @@ def _together(said: Sequence[tuple[FrameCorrection, ...]]) -> dict[str, str]:
 
 
 def _sentence(texts: Sequence[str]) -> str:
-    counts = {text: texts.count(text) for text in dict.fromkeys(texts)}
+    counts = Counter(texts)
     return texts[0] if len(counts) == 1 else "; ".join(f"{text} ({count} of {len(texts)} frames)" for text, count in counts.items())
 
 
 def _named_once(files: list[Path]) -> list[Path]:
-    names = [_stem(p) for p in files]
-    double = next((n for n in names if names.count(n) > 1), None)
-    if double is not None:
-        raise InputError("two frames have one name", value=double, remedy="correct them in two runs")
+    double = [name for name, count in Counter(map(_stem, files)).items() if count > 1]
+    if double:
+        raise InputError("two frames have one name", value=double[0], remedy="correct them in two runs")
     return files
 
 
