@@ -221,6 +221,16 @@ def test_reports_are_written_as_they_are_read(tmp_path: Path) -> None:
     assert float(sigma[0]) == pytest.approx(3e-6 * 1280 * 4.65e-3, rel=1e-5)
 
 
+def test_two_cameras_of_one_name_are_two_cameras(tmp_path: Path) -> None:
+    """Reports call a camera by its type, and a rig has several of one type: none takes the place of another."""
+    australis = AUSTRALIS + AUSTRALIS.replace("Camera 1", "Camera 2").replace("8.3094", "8.4094")
+    found = read_cameras(written(tmp_path / "rig.txt", australis))
+    assert {name: model["c"] for name, model in found.items()} == {"WASP-LT Camera 3": 8.3094, "WASP-LT Camera 3 (2)": 8.4094}
+    one = PHOTOMODELER[PHOTOMODELER.index("Camera1") :].partition("Photograph Standard Deviations")[0]
+    found = read_cameras(written(tmp_path / "both.txt", PHOTOMODELER.replace(one, one + one.replace("Camera1", "Camera2"))))
+    assert len(found) == 2 and len({model["c"] for model in found.values()}) == 1
+
+
 @pytest.mark.parametrize("direction", ["image_to_object", "object_to_image"])
 def test_the_covariance_goes_with_the_form(direction: str) -> None:
     """Against differences: each parameter changed by a step, and the model converted again; correlations to 0.03, as something is lost."""

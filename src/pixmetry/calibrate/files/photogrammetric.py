@@ -184,6 +184,7 @@ def cameras_of_australis(text: str, where: str) -> dict[str, CameraModel]:
         x0, y0 = sensor.centre
         value |= {name: -value.get(name, 0.0) for name in ("p2", "b2")}  # y up
         value |= {"xp": x0 + value["xp"] / mx, "yp": y0 - value["yp"] / my}
+        name = _unused(name, out)
         out[name] = CameraModel.of(sensor, "image_to_object", (), name, "perspective", **value)
     if not out:
         raise InputError("no camera in the report", where=where, allowed="Results for Camera 1 …")
@@ -249,8 +250,14 @@ def cameras_of_photomodeler(text: str, where: str, size: tuple[int, int] | None 
         mx, my = value.pop("width") / pixels[0], value.pop("height") / pixels[1]
         value |= {"xp": value["xp"] / mx - 0.5, "yp": value["yp"] / my - 0.5, "p2": -value["p2"]}
         sensor = Sensor(*pixels, 1000 * mx, 1000 * my)
+        name = _unused(name, out)
         out[name] = CameraModel.of(sensor, "image_to_object", (), name, "perspective", **value)
     return out
+
+
+def _unused(name: str, taken: Mapping[str, CameraModel]) -> str:
+    """The name of a camera, with a number where an earlier camera of the report has it: two of one type are two cameras."""
+    return name if name not in taken else next(f"{name} ({k})" for k in range(2, len(taken) + 2) if f"{name} ({k})" not in taken)
 
 
 def _standard_errors(model: CameraModel, form: CameraModel, known: Mapping[str, Known]) -> dict[str, float]:
