@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from pixmetry.camera.camera import Camera, load_camera
 from pixmetry.camera.kept_steps import KeptSteps
+from pixmetry.camera.unit_maps import MeasuredUnit
 from pixmetry.scene.files import build_scene, read_scene
+from pixmetry.scene.uniform import Uniform
 
 SCENE = {
     "schema": "pixmetry/scene/1",
@@ -57,4 +63,31 @@ def test_what_is_kept_is_bounded_and_cannot_be_changed() -> None:
         kept.window(camera, scene, "one", (0, 0, 200, 200), seed)
         assert kept.held_bytes <= 1 << 20
     with pytest.raises(ValueError, match="read-only"):
-        next(iter(kept._signals.values())).data[0, 0, 0] = 1
+        next(iter(kept._signals.values())).signal.data[0, 0, 0] = 1
+
+
+def test_a_measured_map_lives_as_long_as_what_it_made_is_kept() -> None:
+    """Maps are told apart by their address, which Python gives to the next array once a map is gone."""
+    plain, window = load_camera("imx264_like"), (0, 0, 32, 32)
+    unit = MeasuredUnit(plain.unit_seed, plain.frame_shape)
+
+    def twin(deviation: float) -> tuple[Camera, weakref.ref[np.ndarray]]:
+        response = np.full(plain.frame_shape, deviation, np.float16)
+        maps = {"response_dev_rel": response}
+        chain = tuple(replace(e, maps=maps) if e.name == "sensor.prnu" else e for e in plain.chain)
+        return replace(plain, chain=chain, measured=unit), weakref.ref(response)
+
+    kept = KeptSteps()
+    camera, seen = twin(0.1)
+    first = kept.window(camera, Uniform(2000.0), "even", window).data.mean()
+    del camera
+    gc.collect()
+    assert seen() is not None
+    second = kept.window(twin(0.2)[0], Uniform(2000.0), "even", window).data.mean()
+    assert second > 1.05 * first
+    none = KeptSteps(most_bytes=0)
+    camera, seen = twin(0.1)
+    none.window(camera, Uniform(2000.0), "even", window)
+    del camera
+    gc.collect()
+    assert seen() is None

@@ -137,6 +137,23 @@ def test_without_hum_and_one_over_f_there_are_limits(rng: np.random.Generator):
         assert told["electronics.flicker_noise"]["rms_e"].value * GAIN < 1.0
 
 
+@pytest.mark.parametrize("still", [True, False])
+def test_frames_that_are_all_the_same_tell_neither_hum_nor_noise_of_rows(rng: np.random.Generator, still: bool):
+    """A read-out below rounding; and one frame whose rows differ by a code now and then."""
+    data = np.full((16, *SHAPE), 60, np.uint16)
+    if not still:
+        data[3, 40, 7:9] += 1
+    groups = [Frames("dark", 0.01, data, role="stack")]
+    groups += [Frames("bright" if e else "dark", 1e-3 * k, frames_of(rng, 2, e * k)) for k in range(1, 9) for e in (0.0, 800.0)]
+    with np.errstate(all="raise", under="ignore"):
+        seen = observe_campaign(campaign_of_arrays(groups, bits=12, line_time_us=LINE_US, pixel_clock_mhz=8.0), no_progress)[1]
+    assert seen.dark_rows is not None
+    assert "rms_dn" not in seen.dark_rows.flicker or seen.dark_rows.flicker.limits
+    if still:
+        assert "all the same" in seen.dark_rows.flicker.reasons["rms_dn"]
+    assert "per_row" not in seen.dark_rows.hum
+
+
 def test_page_and_results_have_them(rng: np.random.Generator, tmp_path: Path):
     hum = {"hum_dn": 2.0, "hertz": 4000.0}
     groups = [Frames("dark", 0.01, frames_of(rng, 16, **hum), role="stack")]

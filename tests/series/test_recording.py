@@ -17,7 +17,7 @@ from pixmetry.core.errors import MeasureError
 from pixmetry.core.progress import no_progress
 from pixmetry.files.in_memory import Frames
 from pixmetry.series import job
-from pixmetry.series.recording import bessel_gain, group_of, recordings_of
+from pixmetry.series.recording import _way, bessel_gain, group_of, recordings_of
 from pixmetry.sources.storage.video_codec import Coder, VideoCodec
 
 SHAPE, CLOCK_MHZ = (160, 224), 14.2
@@ -120,6 +120,29 @@ def test_the_gain_of_the_filter_is_that_of_scipy() -> None:
     zeros, poles, gain = bessel(3, 1.0, analog=True, output="zpk", norm="mag")
     expected = np.abs(gain / np.prod([1j * f / 0.2 - p for p in poles], axis=0))
     assert bessel_gain(f, 0.2) == pytest.approx(expected, rel=1e-6)
+
+
+def test_a_frequency_at_which_blocks_of_rows_differ_counts_less(rng: np.random.Generator) -> None:
+    """Exact contrasts of a filter, but one frequency in twelve is far off in each block, by 1 either way: with even weights ln b scatters
+    by 0.4, with weights by a tenth of that."""
+    frequency = np.linspace(0.02, 0.5, 12)
+    zeros, poles, gain = bessel(3, 1.0, analog=True, output="zpk", norm="mag")
+    exact = np.abs(gain / np.prod([1j * frequency / 0.3 - p for p in poles], axis=0))
+    parts = np.tile(exact, (8, 1))
+    parts[:, 4] += np.tile([1.0, -1.0], 4) * rng.uniform(0.9, 1.1, 8)
+    found = _way(frequency, parts, np.ones(12), held=False)
+    assert found is not None and np.exp(found.logarithm) == pytest.approx(0.3, rel=0.01) and found.u < 0.02
+
+
+def test_a_block_that_shows_what_no_other_shows_is_left_out() -> None:
+    """Its frequencies have no weight: a scale by them is 0/0, which was stored as a bandwidth."""
+    frequency = np.linspace(0.02, 0.5, 12)
+    parts = np.full((8, 12), np.nan)
+    parts[:7, :6] = bessel_gain(frequency[:6], 0.3)
+    parts[7, 6:] = bessel_gain(frequency[6:], 0.1)
+    with np.errstate(all="raise"):
+        found = _way(frequency, parts, np.ones(12), held=False)
+    assert found is not None and found.count == 7 and np.exp(found.logarithm) == pytest.approx(0.3, rel=1e-3)
 
 
 def played(scene: np.ndarray, count: int, tape: dict[str, float], rng: np.random.Generator) -> list[np.ndarray]:

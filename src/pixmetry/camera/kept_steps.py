@@ -19,6 +19,14 @@ from pixmetry.core.random import Grid
 MOST_BYTES = 192 << 20
 
 
+@dataclass(frozen=True)
+class _Kept:
+    """A signal, and the measured maps that its mark names by their address: while it is kept, no other map can be there."""
+
+    signal: Signal
+    maps: tuple[np.ndarray, ...]
+
+
 @dataclass
 class KeptSteps:
     """Exposes a window of frame 0, and keeps the signal ahead of each group of sources for the next camera.
@@ -44,12 +52,12 @@ class KeptSteps:
     """
 
     most_bytes: int = MOST_BYTES
-    _signals: OrderedDict[bytes, Signal] = field(default_factory=OrderedDict)
+    _signals: OrderedDict[bytes, _Kept] = field(default_factory=OrderedDict)
 
     @property
     def held_bytes(self) -> int:
         """Of the signals that are kept."""
-        return sum(s.data.nbytes for s in self._signals.values())
+        return sum(kept.signal.data.nbytes for kept in self._signals.values())
 
     def window(
         self, camera: Camera, scene: Scene, scene_mark: str, window: tuple[int, int, int, int], seed: int = 0, quiet: bool = False
@@ -62,26 +70,26 @@ class KeptSteps:
         marks = _marks(camera, needs, scene_mark, seed, quiet)
         ends = _ends_of_groups(camera, needs)
         begin = max((k for k in ends if marks[k] in self._signals), default=0)
-        signal = self._signals[marks[begin]] if begin else None
+        signal = self._signals[marks[begin]].signal if begin else None
         if signal is not None:
             self._signals.move_to_end(marks[begin])
         at = begin
         for end in (k for k in ends if k > begin):
             whole = _grid_at(grid, needs[end])
             signal = camera._run_bands(task, whole, links[at:end], needs[at : end + 1], signal)
-            self._keep(marks[end], signal)
+            self._keep(marks[end], signal, camera)
             at = end
         if signal is None:
             signal = camera.signal(scene, grid)
         return signal.crop(needs[-1])
 
-    def _keep(self, mark: bytes, signal: Signal) -> None:
+    def _keep(self, mark: bytes, signal: Signal, camera: Camera) -> None:
         """Keep a signal, whose data nobody may change."""
         data = signal.data
         if data.nbytes > self.most_bytes:
             return
         data.setflags(write=False)
-        self._signals[mark] = replace(signal, data=data)
+        self._signals[mark] = _Kept(replace(signal, data=data), tuple(m for e in camera.chain for m in e.maps.values()))
         while self.held_bytes > self.most_bytes:
             self._signals.popitem(last=False)
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from pixmetry.camera.light import Light
 from pixmetry.camera.line import Line
+from pixmetry.core.errors import InputError
 from pixmetry.core.random import Grid
 
 
@@ -168,6 +169,17 @@ class Signal:
         if self.line is None:
             raise TypeError(f"a signal of the kind {self.kind} holds no line")
         return self.line
+
+    def need_frame_before(self) -> None:
+        """Refuse frames of which not each follows the one before it, for what a frame leaves in the next.
+
+        Raises
+        ------
+        InputError
+            If the signal holds no successive frames.
+        """
+        if len(self) < 2 or np.any(np.diff(self.grid.frame) != 1):
+            raise InputError("needs the frame before", remedy="give frames that were taken without a pause, and say so (--sequence)")
 
     def with_data(self, data: np.ndarray, kind: Kind | None = None) -> Signal:
         """The same windows with new numbers (and, where the source converts, a new kind)."""

@@ -343,6 +343,9 @@ def _flicker_of(
     ordinates = np.array([k for k in range(1, len(power) - 1) if k not in lines])
     data_v, weight_v = power[ordinates], np.full(len(ordinates), float(frames - 1))
     data, weight = np.concatenate([data_h, data_v]), np.concatenate([weight_h, weight_v])
+    if not data.any():
+        why = "the frames are all the same: rounding hides the noise; raise the black level, or the gain"
+        return replace(Estimates.empty(), reasons={"rms_dn": why}), np.full_like(power, np.nan), {}
     shapes = {c: _shapes(float(c), along, ordinates, size, line_px) for c in (*CORNERS, TYPICAL_CORNER)}
 
     def design(shape: np.ndarray) -> np.ndarray:
@@ -482,7 +485,8 @@ def _whittle(design: np.ndarray, data: np.ndarray, weight: np.ndarray) -> tuple[
     """
     from scipy.optimize import nnls
 
-    model = np.maximum(data, 1e-12)
+    data = np.maximum(data, 1e-12)  # an ordinate of nothing is one of nearly nothing: its logarithm is finite
+    model = data
     for _ in range(8):
         scale = np.sqrt(weight) / model
         values = nnls(design * scale[:, None], data * scale)[0]

@@ -72,7 +72,7 @@ def row_wave(
         return None
     value, row = light
     frames, count = value.shape
-    if count < LEAST_ROWS or np.abs(value).max() < ROUNDING:
+    if count < LEAST_ROWS or np.abs(value).max(initial=0.0) < ROUNDING:
         return None
     if start is not None:
         return _refined(value, place, row, start.per_frame, start.per_row)
@@ -104,6 +104,8 @@ def strongest_wave(value: np.ndarray, place: np.ndarray, row: np.ndarray, hum_pe
 
     The floor of each frequency over the rows is the median over those from frame to frame: noise that rows share is no wave.
     """
+    if np.abs(value).max(initial=0.0) < ROUNDING:  # of frames that are all the same
+        return None
     k = np.rint(place).astype(int)
     grid = np.zeros((PAD * (int(k[-1]) + 1), PAD * int(row[-1] + 1)))
     grid[k[:, None], row] = value
@@ -114,7 +116,7 @@ def strongest_wave(value: np.ndarray, place: np.ndarray, row: np.ndarray, hum_pe
         allowed &= np.abs(per_row - hum_per_row) * span > BESIDE_HUM
     power = power[:, allowed]
     floor = np.median(power, axis=0) / np.log(2)
-    ratio = power / np.maximum(floor, 1e-3 * np.median(floor))
+    ratio = power / np.maximum(floor, max(1e-3 * float(np.median(floor)), 1e-12 * float(power.max())))
     peak = np.unravel_index(int(np.argmax(ratio)), ratio.shape)
     if ratio[peak] < np.log(ratio.size / PAD**2 / CHANCE) + EXTRA:
         return None

@@ -270,7 +270,7 @@ def _way(frequency: Array, parts: Array, known: Array, held: bool) -> _Way | Non
     usual = max(float(np.median(scatter[told])), 1e-12)
     root = np.sqrt(usual / (scatter + usual))  # of the weight
     for part in parts:
-        seen = np.isfinite(part)
+        seen = np.isfinite(part) & told  # what does not count does not scale, either
         if seen.sum() < 4:
             continue
 

@@ -10,7 +10,7 @@ from pixmetry.camera.noise_covariance import frame_correlation
 from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
-from pixmetry.core.errors import InputError, MeasureError
+from pixmetry.core.errors import MeasureError
 from pixmetry.core.number import ONE_SIDED_95, Estimates
 from pixmetry.core.random import Stream
 from pixmetry.sources.processing._codes import bits_of_camera, stored
@@ -84,9 +84,7 @@ def correct(params: TemporalNoiseReduction, signal: Signal, maps: Mapping[str, n
     InputError
         If the signal holds no successive frames.
     """
-    numbers = signal.grid.frame
-    if len(signal) < 2 or np.any(np.diff(numbers) != 1):
-        raise InputError("needs the frame before", remedy="give frames that were taken without a pause, and say so (--sequence)")
+    signal.need_frame_before()
     out = signal.data.astype(np.float32)  # of the first frame the one before is not known: it stays as it is
     out[1:] -= np.float32(params.alpha) * signal.data[:-1]
     out[1:] /= np.float32(1 - params.alpha)

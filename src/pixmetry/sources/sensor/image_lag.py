@@ -157,14 +157,12 @@ def correct(params: ImageLag, signal: Signal, maps: Mapping[str, np.ndarray]) ->
     InputError
         If the signal holds no successive frames.
     """
-    numbers = signal.grid.frame
-    if len(signal) < 2 or np.any(np.diff(numbers) != 1):
-        raise InputError("needs the frame before", remedy="give frames that were taken without a pause, and say so (--sequence)")
+    signal.need_frame_before()
     if params.pocket_e and signal.kind is not Kind.ELECTRONS:
         raise InputError("a pocket is known in electrons, and the gain is not", remedy="add electronics.gain")
     held = _held_after(params, signal.data.astype(float))
     before = np.concatenate([held[:1], held[:-1]])
-    if numbers[0] == 0:
+    if signal.grid.frame[0] == 0:
         before[0] = 0.0  # as `start` has it; of another first frame the one before is not known: it stays as it is
     return signal.with_data((signal.data + held - before).astype(np.float32))
 
