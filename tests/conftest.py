@@ -1,17 +1,20 @@
-"""The seed of a run, and what a test draws from it (see `chance`); and pages whose figures are left blank, for tests of words alone."""
+"""The seed of a run, and what a test draws from it (see `chance`); a browser; pages with blank figures, for tests of words alone."""
 
 from __future__ import annotations
 
 import argparse
 import secrets
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from html import escape
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 from chance import rng_of
+
+CHROMIUM = Path("/usr/bin/chromium")
 
 
 def seed_from(text: str) -> int:
@@ -63,3 +66,15 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Figures of a page keep their place, title, caption and description; what is in them is not drawn, which is most of a page's time."""
     blank = '<svg class="figure" role="img" aria-label="{}"></svg>'
     monkeypatch.setattr("pixmetry.report.drawing.svg_of", lambda drawing, name, alt: blank.format(escape(alt)))
+
+
+@pytest.fixture(scope="module")  # a longer one would keep the event loop from the tests that run one of their own
+def browser() -> Iterator[Any]:
+    """Chromium, without a window."""
+    playwright = pytest.importorskip("playwright.sync_api")
+    if not CHROMIUM.exists():
+        pytest.skip("chromium is not installed")
+    with playwright.sync_playwright() as started:
+        opened = started.chromium.launch(executable_path=str(CHROMIUM), args=["--no-sandbox"])
+        yield opened
+        opened.close()

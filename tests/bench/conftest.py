@@ -13,7 +13,7 @@ TOKEN, PORT = "a-token-of-tests", 8350
 @pytest.fixture(scope="session")
 def server() -> Iterator[Any]:
     pytest.importorskip("starlette")
-    pytest.importorskip("httpx")
+    pytest.importorskip("httpx2")
     from starlette.testclient import TestClient
 
     from pixmetry.bench.server import app_of

@@ -14,7 +14,6 @@ import pytest
 
 pytestmark = pytest.mark.browser
 
-CHROMIUM = Path("/usr/bin/chromium")
 SLOW_MS = 120_000
 HOMES = ("imx264_like", "pulnix_tm6cn_epix_512", "cmos_log_fuga15")  # cameras that a source is put into: the first that takes it
 ON_THE_LINE = ("grabber.", "cable.", "electronics.video")
@@ -31,25 +30,14 @@ def link() -> Iterator[str]:
         process.terminate()
 
 
-@pytest.fixture(scope="module")
-def chromium() -> Iterator[Any]:
-    playwright = pytest.importorskip("playwright.sync_api")
-    if not CHROMIUM.exists():
-        pytest.skip("chromium is not installed")
-    with playwright.sync_playwright() as started:
-        opened = started.chromium.launch(executable_path=str(CHROMIUM), args=["--no-sandbox"])
-        yield opened
-        opened.close()
-
-
 @pytest.fixture(params=[(1440, "light"), (820, "light"), (390, "dark")], ids=["desk", "tablet", "phone"])
 def width(request: pytest.FixtureRequest) -> Any:
     return request.param
 
 
-def opened(chromium: Any, link: str, width: int = 1440, scheme: str = "light", state: dict[str, Any] | None = None) -> Any:
+def opened(browser: Any, link: str, width: int = 1440, scheme: str = "light", state: dict[str, Any] | None = None) -> Any:
     """The page, with what it asked for and what it complained of."""
-    page = chromium.new_page(viewport={"width": width, "height": 900}, color_scheme=scheme)
+    page = browser.new_page(viewport={"width": width, "height": 900}, color_scheme=scheme)
     page.set_default_timeout(SLOW_MS)
     page.asked, page.complaints = [], []
     page.on("request", lambda r: page.asked.append(r.url))
@@ -127,8 +115,8 @@ def home_of(source_id: str, told: dict[str, Any], camera_chains: dict[str, list[
     return {"camera": order[0], "side_px": 64, "chosen": source_id, "add": [source_id], "set": typical}
 
 
-def test_every_control_of_every_source_goes_to_both_ends_and_back(chromium: Any, link: str) -> None:
-    page = opened(chromium, link, state={"camera": HOMES[0], "side_px": 64})
+def test_every_control_of_every_source_goes_to_both_ends_and_back(browser: Any, link: str) -> None:
+    page = opened(browser, link, state={"camera": HOMES[0], "side_px": 64})
     told = page.evaluate("() => bench.catalogue")
     chains = {}
     for name in HOMES:
@@ -155,8 +143,8 @@ def test_every_control_of_every_source_goes_to_both_ends_and_back(chromium: Any,
     page.close()
 
 
-def test_every_camera_and_every_note_opens(chromium: Any, link: str) -> None:
-    page = opened(chromium, link)
+def test_every_camera_and_every_note_opens(browser: Any, link: str) -> None:
+    page = opened(browser, link)
     for selector in ("#camera", "#note"):
         values = page.eval_on_selector_all(f"{selector} option:not([disabled])", "all => all.map((e) => e.value)")
         assert len(values) >= 16
@@ -173,13 +161,13 @@ def test_every_camera_and_every_note_opens(chromium: Any, link: str) -> None:
     page.close()
 
 
-def test_the_error_shown_is_that_of_the_command_line(chromium: Any, link: str, tmp_path: Path) -> None:
+def test_the_error_shown_is_that_of_the_command_line(browser: Any, link: str, tmp_path: Path) -> None:
     from click.testing import CliRunner
 
     from pixmetry.cli import main
 
     state = {"camera": "imx264_like", "set": {"sensor.prnu.pixel_std_rel": 0.02}, "scenario": {"target": {"diameter_px": 9.0}}, "seed": 3}
-    page = opened(chromium, link, state=state)
+    page = opened(browser, link, state=state)
     page.wait_for_selector("body[data-budget]")
     page.wait_for_selector("body[data-found]")
     shown = page.evaluate(SHOWN)
@@ -205,8 +193,8 @@ def test_the_error_shown_is_that_of_the_command_line(chromium: Any, link: str, t
     page.close()
 
 
-def test_nothing_sticks_out_and_everything_has_a_name(chromium: Any, link: str, width: Any) -> None:
-    page = opened(chromium, link, *width, state={"camera": "imx264_like", "chosen": "sensor.prnu"})
+def test_nothing_sticks_out_and_everything_has_a_name(browser: Any, link: str, width: Any) -> None:
+    page = opened(browser, link, *width, state={"camera": "imx264_like", "chosen": "sensor.prnu"})
     page.wait_for_selector("body[data-found]")
     inside, whole = page.evaluate("() => [document.documentElement.scrollWidth, document.documentElement.clientWidth]")
     assert inside <= whole
@@ -222,8 +210,8 @@ def test_nothing_sticks_out_and_everything_has_a_name(chromium: Any, link: str, 
     page.close()
 
 
-def test_the_keyboard_alone_moves_a_source(chromium: Any, link: str) -> None:
-    page = opened(chromium, link, state={"camera": "imx264_like", "chosen": "sensor.prnu"})
+def test_the_keyboard_alone_moves_a_source(browser: Any, link: str) -> None:
+    page = opened(browser, link, state={"camera": "imx264_like", "chosen": "sensor.prnu"})
     page.wait_for_selector("#source-body input[type=range]")
     page.focus("#chain [data-source='sensor.dsnu']")
     page.keyboard.press("Enter")

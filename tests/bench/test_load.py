@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
+import threading
+import time
 from typing import Any
 
 import pytest
 
 from pixmetry.bench.gate import MOST_PAGES, MOST_WAITING, Gate, Overtaken, Refused
 
-httpx = pytest.importorskip("httpx")
+httpx = pytest.importorskip("httpx2")
 pytest.importorskip("starlette")
 
 TOKEN, PORT = "token", 8351
@@ -47,36 +50,128 @@ def test_ten_pages_at_once_get_their_own_pictures() -> None:
     assert together == alone and len(set(alone)) == 10
 
 
-def test_a_page_that_floods_is_refused_and_others_go_on() -> None:
+def test_a_page_that_floods_waits_for_ten_others_and_not_they_for_it() -> None:
     async def work(client: Any) -> Any:
-        flood = [asyncio.ensure_future(asked(client, "flood", n)) for n in range(300)]
+        flood = [asyncio.ensure_future(asked(client, "flood", n, path)) for n in range(150) for path in ("picture", "found")]
         await asyncio.sleep(0)
-        replies = await asyncio.gather(*flood)
-        other = await asked(client, "other", 7)
-        again = await asked(client, "flood", 7)
-        return replies, other, again
+        others = await asyncio.gather(*(asked(client, f"page {n}", n) for n in range(10)))
+        begun = sum(one.done() and "overtaken" not in one.result().json() for one in flood)
+        last = await asked(client, "other", 9)
+        return await asyncio.gather(*flood), others, begun, last
 
-    replies, other, again = with_server(work)
-    kinds = {"picture": 0, "overtaken": 0, "refused": 0}
-    for reply in replies:
-        assert reply.status_code in (200, 503)
-        kinds["refused" if reply.status_code == 503 else next(k for k in ("picture", "overtaken") if k in reply.json())] += 1
-    assert kinds["refused"] >= 300 - MOST_WAITING - 10 and kinds["overtaken"] > 0 and kinds["picture"] >= 1
-    assert other.json()["picture"]["data"] == again.json()["picture"]["data"]
+    replies, others, begun, last = with_server(work)
+    assert all(reply.status_code == 200 for reply in [*replies, *others])  # nobody is refused
+    assert [set(reply.json()) for reply in others] == [{"picture", "true_px"}] * 10
+    assert others[9].json()["picture"]["data"] == last.json()["picture"]["data"]
+    answered = [reply.json() for reply in replies if "overtaken" not in reply.json()]
+    assert 1 <= begun <= 3 and 1 <= len(answered) <= 4  # the first that began, and the newest: between them it was the turn of the others
+
+
+def test_pages_under_ever_new_names_are_refused_before_those_that_were_there() -> None:
+    async def work(client: Any) -> Any:
+        for n in range(10):
+            await asked(client, f"page {n}", n)
+        flood = [asyncio.ensure_future(asked(client, f"new {n}", n % 3)) for n in range(200)]
+        await asyncio.sleep(0.05)
+        others = await asyncio.gather(*(asked(client, f"page {n}", n) for n in range(10)))
+        return await asyncio.gather(*flood), others
+
+    replies, others = with_server(work)
+    assert [reply.status_code for reply in others] == [200] * 10
+    refused = sum(reply.status_code == 503 for reply in replies)
+    assert refused >= 200 - MOST_WAITING - 10 and all(reply.headers["retry-after"] for reply in replies if reply.status_code == 503)
 
 
 def test_the_gate_forgets_pages_and_lets_the_newest_through() -> None:
     async def run() -> None:
         gate, done = Gate(), []
         for n in range(3 * MOST_PAGES):
-            await gate.run(f"page {n}", lambda: None)
-        assert len(gate.newest) <= MOST_PAGES
-        results = await asyncio.gather(*(gate.run("one", lambda n=n: done.append(n)) for n in range(5)), return_exceptions=True)
+            await gate.run(f"page {n}", "a", lambda go_on: None)
+        assert len(gate.seats.known) <= MOST_PAGES
+        results = await asyncio.gather(*(gate.run("one", "a", lambda go_on, n=n: done.append(n)) for n in range(5)), return_exceptions=True)
         assert done == [0, 4] and [isinstance(r, Overtaken) for r in results] == [False, True, True, True, False]  # the first had begun
-        results = await asyncio.gather(*(gate.run(str(n), lambda: None) for n in range(MOST_WAITING + 20)), return_exceptions=True)
-        assert sum(isinstance(r, Refused) for r in results) in range(1, 21) and gate.waiting == 0
+        crowd = [gate.run(str(n), "a", lambda go_on: None) for n in range(MOST_WAITING + 20)]
+        results = await asyncio.gather(*crowd, return_exceptions=True)
+        assert sum(isinstance(r, Refused) for r in results) == 19 and not gate.waiting and gate.present is None
 
     asyncio.run(run())
+
+
+def test_pages_take_turns_and_a_picture_ends_what_is_slower() -> None:
+    async def run() -> list[str]:
+        gate, order, held = Gate(), [], threading.Event()
+
+        def slow(go_on: Any) -> None:
+            held.set()
+            for _ in range(1000):
+                time.sleep(0.01)
+                go_on()
+
+        def note(word: str) -> Any:
+            return lambda go_on: order.append(word)
+
+        first = asyncio.ensure_future(gate.run("a", "found", slow))
+        while not held.is_set():
+            await asyncio.sleep(0.001)
+        kinds = [("a", "fields"), ("a", "line"), ("b", "found"), ("b", "picture"), ("c", "found"), ("a", "picture")]
+        rest = [asyncio.ensure_future(gate.run(page, kind, note(f"{page} {kind}"))) for page, kind in kinds]
+        with pytest.raises(Overtaken):
+            await first
+        await asyncio.gather(*rest)
+        return order
+
+    assert asyncio.run(run()) == ["a picture", "b picture", "c found", "a fields", "b found", "a line"]
+
+
+def test_what_is_announced_and_does_not_come_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    from starlette.requests import Request
+
+    from pixmetry.bench import server
+    from pixmetry.core.errors import InputError
+
+    monkeypatch.setattr(server, "READING_S", 0.02)
+
+    async def run() -> None:
+        desk = server.Desk()
+
+        async def nothing() -> Any:
+            await asyncio.sleep(60)
+
+        def request(length: int) -> Request:
+            return Request({"type": "http", "headers": [(b"content-length", str(length).encode())]}, nothing)
+
+        most = server.MOST_READING // server.MOST_BYTES
+        crowd = await asyncio.gather(*(desk.sent(request(server.MOST_BYTES)) for _ in range(most + 5)), return_exceptions=True)
+        assert [type(one) for one in crowd] == [InputError] * most + [Refused] * 5
+        assert desk.reading == 0
+
+    asyncio.run(run())
+
+
+@pytest.mark.skipif(os.name != "posix", reason="a process cannot be stopped here")
+def test_the_process_of_budgets_is_still_while_pictures_are_asked_for() -> None:
+    from pixmetry.bench.clerk import STILL_S, Clerk
+
+    def state_of(number: int) -> str:
+        with open(f"/proc/{number}/stat", encoding="ascii") as file:
+            return file.read().rpartition(")")[2].split()[0]
+
+    async def run() -> list[bool]:
+        clerk = Clerk()
+        process = await clerk._running()
+        seen = []
+        for _ in range(3):
+            clerk.be_still()
+            await asyncio.sleep(0.4 * STILL_S)
+            seen.append(state_of(process.pid) == "T")
+        await asyncio.sleep(1.5 * STILL_S)
+        seen.append(state_of(process.pid) != "T")
+        clerk.be_still()
+        await clerk.stop()
+        return [*seen, process.returncode is not None]
+
+    if os.path.exists("/proc/self/stat"):
+        assert all(asyncio.run(run()))
 
 
 def test_a_budget_that_nobody_reads_any_more_ends_and_the_next_one_begins() -> None:

@@ -67,7 +67,7 @@ def test_what_is_damaged_or_no_result_is_refused(tmp_path: Path) -> None:
 
 def test_the_server_gives_the_result_to_who_has_the_link(tmp_path: Path) -> None:
     pytest.importorskip("starlette")
-    pytest.importorskip("httpx")
+    pytest.importorskip("httpx2")
     from starlette.testclient import TestClient
 
     from pixmetry.bench.server import app_of_result

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
+import signal
 import sys
 from collections import OrderedDict
 from collections.abc import AsyncIterator, Sequence
 
-from pixmetry.bench.gate import MOST_PAGES, MOST_WAITING, Overtaken, Refused
+from pixmetry.bench.gate import MOST_PAGES, Overtaken, Refused, Seats
 
 LONGEST_LINE = 1 << 24
 PATIENCE_S = 15.0  # for a request to end after it was told to; then the process is ended
+STILL_S = 0.25  # without a picture asked for, after which a process that was stopped goes on
 ENDED = b'{"kind": "error", "text": "the budget could not be computed: its process ended"}\n'
 
 
@@ -31,6 +34,8 @@ class Clerk:
         self.busy, self.count = False, 0
         self.waiting: OrderedDict[str, asyncio.Future[None]] = OrderedDict()  # the newest of each page, in the order of their turns
         self.newest: dict[str, int] = {}
+        self.seats = Seats()
+        self.waking: asyncio.TimerHandle | None = None
         self.present: asyncio.Queue[bytes | None] | None = None
 
     async def lines(self, who: str, state: dict[str, object]) -> AsyncIterator[bytes]:
@@ -46,8 +51,9 @@ class Clerk:
         older = self.waiting.pop(who, None)
         if older is not None and not older.done():
             older.set_exception(Overtaken())
-        if len(self.waiting) >= MOST_WAITING:
-            raise Refused
+        pushed_out = self.seats.given_up_for(who, self.waiting)
+        if pushed_out is not None:
+            self.waiting.pop(pushed_out).set_exception(Refused())
         self.count += 1
         self.newest.pop(who, None)
         mine = self.newest[who] = self.count
@@ -63,6 +69,7 @@ class Clerk:
             self._next()
             raise
         answer = self.present = asyncio.Queue()  # from here on `_read` calls the next, at the end of the request
+        self.seats.answered(who)
         self._send(process, {"state": state})
         ended = False
         try:
@@ -105,7 +112,10 @@ class Clerk:
         if self.process is None or self.process.returncode is not None or self.reading is None or self.reading.done():
             pipe = asyncio.subprocess.PIPE
             module = ("-m", "pixmetry.bench.worker", *self.given)
-            self.process = await asyncio.create_subprocess_exec(sys.executable, *module, stdin=pipe, stdout=pipe, limit=LONGEST_LINE)
+            # in a group of its own, which the system wakes if this process dies while the other is stopped
+            own = 0 if os.name == "posix" else None
+            command = (sys.executable, *module)
+            self.process = await asyncio.create_subprocess_exec(*command, stdin=pipe, stdout=pipe, limit=LONGEST_LINE, process_group=own)
             self.reading = asyncio.ensure_future(self._read(self.process))
         return self.process
 
@@ -132,6 +142,21 @@ class Clerk:
         assert process.stdin is not None
         if process.returncode is None and not process.stdin.is_closing():
             process.stdin.write(json.dumps(request).encode() + b"\n")
+
+    def be_still(self) -> None:
+        """Stop the process while pictures are computed: it goes on when none was asked for during `STILL_S`; only where the system can."""
+        if os.name != "posix" or self.process is None or self.process.returncode is not None:
+            return
+        if self.waking is None:
+            self.process.send_signal(signal.SIGSTOP)
+        else:
+            self.waking.cancel()
+        self.waking = asyncio.get_running_loop().call_later(STILL_S, self._wake)
+
+    def _wake(self) -> None:
+        self.waking = None
+        if self.process is not None and self.process.returncode is None:
+            self.process.send_signal(signal.SIGCONT)
 
     def _kill_if(self, answer: asyncio.Queue[bytes | None]) -> None:
         """End the process if it still computes what nobody wants."""

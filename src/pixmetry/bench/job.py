@@ -13,7 +13,7 @@ from pixmetry.core.extras import import_extra
 
 ADDRESS = "127.0.0.1"
 TOKEN_BYTES = 24
-MOST_CONNECTIONS = 256
+MOST_CONNECTIONS = 1000
 
 
 def open_bench(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -82,14 +83,15 @@ class Found:
             "true_px": self.true_px,
             "found_px": self.found_px,
             "covariance_px2": self.covariance_px2,
+            "u_px": None if self.covariance_px2 is None else float(np.sqrt(0.5 * (self.covariance_px2[0] + self.covariance_px2[2]))),
             "error_px": self.error_px,
             "flags": self.flags,
             "reason": self.reason,
         }
 
 
-def picture_of(layout: Layout, kept: KeptSteps, quiet: bool = False) -> Picture:
-    """The window of the state's frame; ``quiet``: every temporal draw at its mean.
+def picture_of(layout: Layout, kept: KeptSteps, quiet: bool = False, go_on: Callable[[], None] | None = None) -> Picture:
+    """The window of the state's frame; ``quiet``: every temporal draw at its mean; ``go_on`` as of `KeptSteps.window`.
 
     Raises
     ------
@@ -97,7 +99,7 @@ def picture_of(layout: Layout, kept: KeptSteps, quiet: bool = False) -> Picture:
         If the target lies outside of the frame, or the camera makes no codes.
     """
     bits, window = stored_bits(layout.camera), layout.window
-    codes = kept.window(layout.camera, layout.seen, repr(layout.scene), window, layout.state.seed, quiet).data[0]
+    codes = kept.window(layout.camera, layout.seen, repr(layout.scene), window, layout.state.seed, quiet, go_on).data[0]
     return Picture(codes.astype(np.uint8 if bits <= 8 else np.uint16), window[0], window[1], bits)
 
 

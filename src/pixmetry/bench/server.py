@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import hmac
 import json
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from pixmetry.bench.clerk import Clerk
 from pixmetry.bench.controls import camera_record, catalogue_record
-from pixmetry.bench.gate import Gate, Overtaken, Refused
+from pixmetry.bench.gate import AHEAD, Gate, GoOn, Overtaken, Refused
 from pixmetry.bench.picture import found_in, picture_of, without_chosen
 from pixmetry.bench.result import Result
 from pixmetry.bench.state import BenchState, Shelf, read_state
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
     from starlette.responses import Response
 
 MOST_BYTES = 512 << 10  # of what a page may send
+MOST_READING = 64 << 20  # bytes, announced, of all that is being read
+READING_S = 5.0  # in which a page must send what it announced
 LONGEST_NAME = 64  # of a page
 SECURITY = {
     "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data: blob:; connect-src 'self'; "
@@ -39,7 +42,7 @@ SECURITY = {
     "Cache-Control": "no-store",
 }
 TYPES = {"html": "text/html; charset=utf-8", "css": "text/css; charset=utf-8", "js": "text/javascript; charset=utf-8"}
-Work = Callable[[BenchState], Any]
+Work = Callable[[BenchState, GoOn], Any]
 
 
 def page_files() -> dict[str, tuple[bytes, str]]:
@@ -50,6 +53,61 @@ def page_files() -> dict[str, tuple[bytes, str]]:
         if ending in TYPES:
             found[path.name] = path.read_bytes(), TYPES[ending]
     return found
+
+
+def page_route(first: str) -> Callable[[Request], Awaitable[Response]]:
+    """The endpoint that gives the files of the page; ``first`` where none is named."""
+    from starlette.responses import Response
+
+    pages = page_files()
+
+    async def page(request: Request) -> Response:
+        name = request.path_params.get("name") or first
+        if name not in pages:
+            return Response("there is no such file", 404)
+        body, kind = pages[name]
+        return Response(body, media_type=kind)
+
+    return page
+
+
+class Desk:
+    """Takes in what pages send: not more at a time than `MOST_READING`, and none for longer than `READING_S`."""
+
+    def __init__(self) -> None:
+        self.reading = 0
+
+    async def sent(self, request: Request) -> dict[str, Any]:
+        """What a page sent.
+
+        Raises
+        ------
+        Refused
+            If too much is being read already.
+        InputError
+            If it is no JSON with keys, or does not come.
+        """
+        length = int(request.headers["content-length"])
+        if self.reading + length > MOST_READING:
+            raise Refused
+        self.reading += length
+        try:
+            body = await asyncio.wait_for(request.body(), READING_S)
+        except TimeoutError:
+            raise InputError("less came than was announced", where="state", remedy="send it again") from None
+        finally:
+            self.reading -= length
+        try:
+            values = json.loads(body)
+        except (ValueError, RecursionError):
+            raise InputError("not JSON", where="state") from None
+        if not isinstance(values, dict):
+            raise InputError("not a state", where="state", allowed="keys with values")
+        return values
+
+    async def state(self, request: Request) -> BenchState:
+        """The state that a page sent."""
+        return read_state(await self.sent(request))
 
 
 class Guard:
@@ -122,17 +180,10 @@ def app_of(shelf: Shelf, token: str, port: int, given: tuple[str, ...] = (), fir
     """
     from starlette.applications import Starlette
     from starlette.middleware import Middleware
-    from starlette.responses import JSONResponse, Response, StreamingResponse
+    from starlette.responses import JSONResponse, StreamingResponse
     from starlette.routing import Route
 
-    gate, kept, clerk, pages = Gate(), KeptSteps(), Clerk(given), page_files()
-
-    async def page(request: Request) -> Response:
-        name = request.path_params.get("name") or "index.html"
-        if name not in pages:
-            return Response("there is no such file", 404)
-        body, kind = pages[name]
-        return Response(body, media_type=kind)
+    gate, kept, clerk, desk, page = Gate(), KeptSteps(), Clerk(given), Desk(), page_route("index.html")
 
     async def opening(request: Request) -> Response:
         return JSONResponse({"catalogue": catalogue_record(), "cameras": list(shelf.names), "state": dict(first or {})})
@@ -141,9 +192,12 @@ def app_of(shelf: Shelf, token: str, port: int, given: tuple[str, ...] = (), fir
         """An endpoint that takes a state and answers with what ``work`` makes of it."""
 
         async def endpoint(request: Request) -> Response:
+            kind = request.url.path.rpartition("/")[2]
             try:
-                state = await _state(request)
-                return JSONResponse(finite(await gate.run(_page_of(request) + request.url.path, lambda: work(state))))
+                state = await desk.state(request)
+                if kind in AHEAD:
+                    clerk.be_still()
+                return JSONResponse(finite(await gate.run(_page_of(request), kind, lambda go_on: work(state, go_on))))
             except (PixmetryError, Refused, Overtaken) as problem:
                 return _problem(problem)
 
@@ -151,9 +205,9 @@ def app_of(shelf: Shelf, token: str, port: int, given: tuple[str, ...] = (), fir
 
     async def budget(request: Request) -> Response:
         try:
-            state = await _state(request)
-            shelf.laid_out(state)
-        except PixmetryError as problem:
+            state = await desk.state(request)
+            await gate.run(_page_of(request), "budget", lambda go_on: shelf.laid_out(state))
+        except (PixmetryError, Refused, Overtaken) as problem:
             return _problem(problem)
         lines = clerk.lines(_page_of(request), state.model_dump(mode="json", by_alias=True))
         try:
@@ -174,42 +228,44 @@ def app_of(shelf: Shelf, token: str, port: int, given: tuple[str, ...] = (), fir
     async def read(request: Request) -> Response:
         """The record of a camera file or a data sheet that the page sends as text."""
         try:
-            text = (await _sent(request)).get("text")
+            text = (await desk.sent(request)).get("text")
             record = dict(parse_yaml(text if isinstance(text, str) else "", "the file"))
             state = read_state({"record": record})
-            await gate.run(_page_of(request) + request.url.path, lambda: shelf.laid_out(state))
+            await gate.run(_page_of(request), "read", lambda go_on: shelf.laid_out(state))
             return JSONResponse({"record": record})
         except (PixmetryError, Refused, Overtaken) as problem:
             return _problem(problem)
 
-    def picture(state: BenchState) -> Any:
+    def picture(state: BenchState, go_on: GoOn) -> Any:
         layout = shelf.laid_out(state)
         seen = picture_of(layout, kept)
         return {"picture": seen.to_record(), "true_px": layout.true_px}
 
-    def found(state: BenchState) -> Any:
+    def found(state: BenchState, go_on: GoOn) -> Any:
         layout = shelf.laid_out(state)
-        seen = picture_of(layout, kept)
+        seen = picture_of(layout, kept, go_on=go_on)
+        go_on()
         answer: dict[str, Any] = {"found": found_in(seen, layout, layout.true_px).to_record()}
         other = without_chosen(layout)
         if other is not None:
             try:
-                beside = picture_of(other, kept)
+                beside = picture_of(other, kept, go_on=go_on)
             except PixmetryError:  # no frame is made without it
                 return answer
+            go_on()
             answer |= {"beside": beside.to_record(), "beside_found": found_in(beside, other, other.true_px).to_record()}
         return answer
 
     works: dict[str, Work] = {
-        "camera": lambda state: camera_record(shelf.laid_out(state)),
+        "camera": lambda state, go_on: camera_record(shelf.laid_out(state)),
         "picture": picture,
         "found": found,
-        "fields": lambda state: even_fields(shelf.laid_out(state), kept),
-        "line": lambda state: video_line(shelf.laid_out(state), kept),
-        "hour": lambda state: hour(shelf.laid_out(state)),
-        "pixel": lambda state: over_a_pixel(shelf, state, kept),
-        "rows": lambda state: exposed_rows(shelf.laid_out(state)),
-        "away": lambda state: taken_away(shelf.laid_out(state)),
+        "fields": lambda state, go_on: even_fields(shelf.laid_out(state), kept),
+        "line": lambda state, go_on: video_line(shelf.laid_out(state), kept),
+        "hour": lambda state, go_on: hour(shelf.laid_out(state)),
+        "pixel": lambda state, go_on: over_a_pixel(shelf, state, kept, go_on),
+        "rows": lambda state, go_on: exposed_rows(shelf.laid_out(state)),
+        "away": lambda state, go_on: taken_away(shelf.laid_out(state)),
     }
 
     @asynccontextmanager
@@ -235,14 +291,7 @@ def app_of_result(result: Result, token: str, port: int) -> Starlette:
     from starlette.responses import JSONResponse, Response
     from starlette.routing import Route
 
-    pages = page_files()
-
-    async def page(request: Request) -> Response:
-        name = request.path_params.get("name") or "view.html"
-        if name not in pages:
-            return Response("there is no such file", 404)
-        body, kind = pages[name]
-        return Response(body, media_type=kind)
+    page = page_route("view.html")
 
     async def record(request: Request) -> Response:
         return JSONResponse(finite(result.to_record()))
@@ -264,20 +313,6 @@ def hosts_of(port: int) -> frozenset[str]:
 
 def _page_of(request: Request) -> str:
     return request.headers.get("x-page", "")[:LONGEST_NAME]
-
-
-async def _state(request: Request) -> BenchState:
-    return read_state(await _sent(request))
-
-
-async def _sent(request: Request) -> dict[str, Any]:
-    try:
-        values = json.loads(await request.body())
-    except (ValueError, RecursionError):
-        raise InputError("not JSON", where="state") from None
-    if not isinstance(values, dict):
-        raise InputError("not a state", where="state", allowed="keys with values")
-    return values
 
 
 def _problem(problem: Exception) -> Response:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -108,8 +109,11 @@ def hour(layout: Layout) -> dict[str, Any]:
     }
 
 
-def over_a_pixel(shelf: Shelf, state: BenchState, kept: KeptSteps) -> dict[str, Any]:
-    """Error of the chosen estimator, and of the template, while the target goes over a pixel along x; every temporal draw at its mean."""
+def over_a_pixel(shelf: Shelf, state: BenchState, kept: KeptSteps, go_on: Callable[[], None]) -> dict[str, Any]:
+    """Error of the chosen estimator, and of the template, while the target goes over a pixel along x; every temporal draw at its mean.
+
+    ``go_on`` is called now and then; it raises to end the work.
+    """
     layout = shelf.laid_out(state)
     x0, y0 = layout.place
     places = np.linspace(-0.5, 0.5, PLACES)
@@ -117,7 +121,7 @@ def over_a_pixel(shelf: Shelf, state: BenchState, kept: KeptSteps) -> dict[str, 
     errors: dict[str, list[float | None]] = {name: [] for name in names}
     for dx in places:
         one = shelf.laid_out(state.model_copy(update={"x_px": float(round(x0) + dx), "y_px": y0, "side_px": 64}))
-        picture = picture_of(one, kept, quiet=True)
+        picture = picture_of(one, kept, quiet=True, go_on=go_on)
         for name in names:
             found = found_in(picture, replace(one, state=one.state.model_copy(update={"estimator": name})), one.true_px)
             errors[name].append(None if found.error_px is None else found.error_px[0])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import OrderedDict
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -60,9 +61,19 @@ class KeptSteps:
         return sum(kept.signal.data.nbytes for kept in self._signals.values())
 
     def window(
-        self, camera: Camera, scene: Scene, scene_mark: str, window: tuple[int, int, int, int], seed: int = 0, quiet: bool = False
+        self,
+        camera: Camera,
+        scene: Scene,
+        scene_mark: str,
+        window: tuple[int, int, int, int],
+        seed: int = 0,
+        quiet: bool = False,
+        go_on: Callable[[], None] | None = None,
     ) -> Signal:
-        """Expose one window ``(row0, col0, rows, cols)`` of frame 0; ``scene_mark`` is equal only for equal scenes."""
+        """Expose one window ``(row0, col0, rows, cols)`` of frame 0.
+
+        ``scene_mark`` is equal only for equal scenes. ``go_on`` is called ahead of each group of sources; it raises to end the work.
+        """
         row0, col0, rows, cols = window
         grid = Grid(np.array([0]), np.array([row0]), np.array([col0]), (rows, cols))
         links, task = camera.links, _Task(scene, camera.streams(seed, quiet), {})
@@ -75,6 +86,8 @@ class KeptSteps:
             self._signals.move_to_end(marks[begin])
         at = begin
         for end in (k for k in ends if k > begin):
+            if go_on is not None:
+                go_on()
             whole = _grid_at(grid, needs[end])
             signal = camera._run_bands(task, whole, links[at:end], needs[at : end + 1], signal)
             self._keep(marks[end], signal, camera)

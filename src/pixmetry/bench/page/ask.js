@@ -40,6 +40,7 @@ export class Latest {
 export async function once(path, state) {
   const reply = await fetch(path, { method: "POST", headers, body: JSON.stringify(state) });
   const answer = await reply.json();
+  if (answer.overtaken) return once(path, state); // a picture went ahead
   if (answer.error) throw new Error(answer.error);
   return answer;
 }

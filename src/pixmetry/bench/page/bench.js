@@ -1,11 +1,10 @@
 // The bench: one state, what the server makes of it, and what shows it.
-import { $, digits, el, mpx, packed, px, rms, unpacked } from "./dom.js";
-import { Follow, Latest } from "./ask.js";
+import { $, digits, el, mpx, packed, px, unpacked } from "./dom.js";
+import { Follow, Latest, once } from "./ask.js";
 import { drawFound, errorText, paint, profiles, screen } from "./draw.js";
 import { control } from "./controls.js";
 import { makeViews, refresh, show as showView } from "./views.js";
 import { takeAway } from "./away.js";
-import { once } from "./ask.js";
 
 const REST_MS = 160; // without a move, before the slow things are asked for
 const LEAST_SHARE = 1e-4; // of the error, from which on a source that the camera is not described with is shown in the chain
@@ -25,25 +24,29 @@ const failed = (text) => { said(text); answered++; };
 const pictures = new Latest("picture", showPicture, failed);
 const foundIn = new Latest("found", showFound, failed);
 const cameras = new Latest("camera", showCamera, failed);
-const budgets = new Follow("budget", showLine, failed);
+const budgets = new Follow("budget", showLine, said);
 let resting = 0;
+let serial = 0; // of the state: an answer about an older one is not shown over a newer one
+
+const keepLink = () => history.replaceState(null, "", `#${packed(bench.state)}`); // not at every move: browsers allow few in a second
 
 function changed(redraw = false) {
-  history.replaceState(null, "", `#${packed(bench.state)}`);
+  serial++;
   said("");
-  bench.asked = performance.now();
   pictures.ask(bench.state);
   bench.stale = true;
   budgets.stop();
   clearTimeout(resting);
   resting = setTimeout(rest, REST_MS);
-  if (redraw) cameras.ask(bench.state);
+  if (redraw) cameras.ask(bench.state, serial);
 }
 
 function rest() {
-  foundIn.ask(bench.state);
+  if (pictures.busy) { resting = setTimeout(rest, REST_MS / 4); return; }
+  keepLink();
+  foundIn.ask(bench.state, serial);
   refresh();
-  cameras.ask(bench.state);
+  cameras.ask(bench.state, serial);
   bench.rows = new Map();
   bench.together = null;
   budgets.ask(bench.state);
@@ -67,12 +70,12 @@ function showPicture(answer) {
   bench.codes = paint(shown.canvas, answer.picture);
   drawFound(shown.over, answer.picture, { ...stale });
   $("profiles").replaceChildren(...profiles(answer.picture, { true_px: answer.true_px }, bench.codes));
-  bench.drawn = performance.now();
   answered++;
   document.body.dataset.drawn = String(Number(document.body.dataset.drawn ?? 0) + 1);
 }
 
-function showFound(answer) {
+function showFound(answer, asked) {
+  if (asked !== serial) return;
   bench.found = answer.found;
   if (!shown || !bench.picture) return;
   drawFound(shown.over, bench.picture, answer.found);
@@ -93,7 +96,8 @@ function showFound(answer) {
 
 const sourceOf = (name) => bench.camera?.chain.find((e) => e.name === name)?.source ?? name;
 
-function showCamera(camera) {
+function showCamera(camera, asked) {
+  if (asked !== serial) return;
   const first = bench.camera === null || bench.camera.name !== camera.name || bench.camera.chain.length !== camera.chain.length;
   bench.camera = camera;
   showChain();
@@ -104,59 +108,66 @@ function showCamera(camera) {
 
 const panelMark = () => `${bench.state.chosen}|${bench.camera.chain.find((e) => e.name === bench.state.chosen)?.on}|${bench.camera.name}|${bench.camera.chain.length}`;
 
-function share(row) {
-  if (!row) return 0;
-  if (!bench.before) return row.share || 0;
-  const whole = [...bench.rows.values()].filter((r) => counted(r)).reduce((s, r) => s + r.before_px ** 2, 0);
-  return whole && counted(row) ? row.before_px ** 2 / whole : 0;
-}
+const share = (row) => (row && bench.shares?.[row.name]?.[bench.before ? 1 : 0]) || 0;
 
 const counted = (row) => ["measured", "from the sheet", "described", "typical"].includes(row.status);
 
-function chip(name, title, on, changedHere, row) {
-  const part = share(row);
-  const bar = el("i", { "aria-hidden": "true" });
+// The chip of a source. It is made once and changed in place, so that neither focus nor a click on it is lost while rows come in.
+const chips = { chain: new Map(), absent: new Map() };
+
+function chip(where, name, title, on, changedHere, row) {
+  if (!chips[where].has(name)) chips[where].set(name, el("li", {}, el("button", { type: "button", "data-source": name, onclick: () => choose(name) }, el("i", { "aria-hidden": "true" }), el("span"), el("b"))));
+  const item = chips[where].get(name), button = item.firstChild, [bar, words, number] = button.children;
+  const part = share(row), size = row && (bench.before ? row.before_px : row.after_px);
+  button.className = `chip${part > CALM_SHARE ? " large" : ""}${on ? "" : " off"}${changedHere ? " changed" : ""}`;
+  button.setAttribute("aria-pressed", String(bench.state.chosen === name));
+  button.setAttribute("aria-label", `${title}${on ? "" : ", switched off"}${changedHere ? ", changed" : ""}${part ? `, ${digits(100 * part, 2)} % of the error` : ""}`);
   bar.style.width = `${(100 * Math.sqrt(part)).toFixed(1)}%`;
-  const size = row && (bench.before ? row.before_px : row.after_px);
-  const button = el(
-    "button",
-    {
-      type: "button", class: `chip${part > CALM_SHARE ? " large" : ""}${on ? "" : " off"}${changedHere ? " changed" : ""}`, "data-source": name,
-      "aria-pressed": String(bench.state.chosen === name), onclick: () => choose(name),
-      "aria-label": `${title}${on ? "" : ", switched off"}${part ? `, ${digits(100 * part, 2)} % of the error` : ""}`,
-    },
-    bar, el("span", {}, title), el("b", {}, on && size > 5e-6 ? mpx(size).replace(" mpx", "") : ""),
-  );
-  return el("li", {}, button);
+  words.textContent = title;
+  number.textContent = on && size > 5e-6 ? mpx(size).replace(" mpx", "") : "";
+  return item;
 }
+
+// Give a list these items; where they are there already, in this order, nothing is touched.
+function list(box, items) {
+  if (box.children.length !== items.length || items.some((item, k) => box.children[k] !== item)) {
+    const focused = box.contains(document.activeElement) ? document.activeElement : null;
+    box.replaceChildren(...items);
+    if (focused && box.contains(focused)) focused.focus();
+  }
+}
+
+const heads = new Map();
 
 function showChain() {
   const { catalogue, camera } = bench;
-  const focus = document.activeElement?.dataset?.source;
   const rows = new Map([...bench.rows.values()].map((r) => [r.name, r]));
   const stages = catalogue.stages.map((stage) => {
     const there = camera.chain.filter((e) => catalogue.sources[e.source].stage === stage.id).map((e) => [e.name, e]);
     const more = [...rows.values()].filter((r) => !camera.chain.some((e) => e.source === r.source_id) && counted(r) && share(r) > LEAST_SHARE && catalogue.sources[r.source_id]?.stage === stage.id);
     const whole = [...there.map(([n]) => rows.get(n)), ...more].reduce((s, r) => s + share(r), 0);
-    const items = there.map(([n, e]) => chip(n, catalogue.sources[e.source].title, e.on, e.changed.length > 0, rows.get(n)));
-    items.push(...more.map((r) => chip(r.name, `${r.title} (typical)`, true, false, r)));
-    const head = el("li", { "data-stage": stage.id, class: items.length > 12 ? "long" : "" }, el("div", { class: "stage" }, el("span", {}, stage.title), el("span", {}, whole >= 0.0005 ? `${digits(100 * whole, 2)} %` : "")), el("ul", {}, items));
+    const items = there.map(([n, e]) => chip("chain", n, catalogue.sources[e.source].title, e.on, hasChanges(n), rows.get(n)));
+    items.push(...more.map((r) => chip("chain", r.name, `${r.title} (typical)`, true, false, r)));
+    if (!heads.has(stage.id)) heads.set(stage.id, el("li", { "data-stage": stage.id }, el("div", { class: "stage" }, el("span", {}, stage.title), el("span")), el("ul")));
+    const head = heads.get(stage.id);
+    head.className = items.length > 12 ? "long" : "";
+    head.querySelector(".stage").lastChild.textContent = whole >= 0.0005 ? `${digits(100 * whole, 2)} %` : "";
     head.style.borderTopColor = whole > 0 ? `color-mix(in srgb, var(--hot) ${Math.round(100 * Math.sqrt(whole))}%, var(--grid))` : "";
+    list(head.lastChild, items);
     return head;
   });
-  $("chain").replaceChildren(...stages);
+  list($("chain"), stages);
   const absent = Object.values(catalogue.sources).filter((s) => !camera.chain.some((e) => e.source === s.id));
-  $("absent-list").replaceChildren(...absent.map((s) => chip(s.id, s.title, true, false, rows.get(s.id))));
-  if (focus) document.querySelector(`#chain [data-source="${CSS.escape(focus)}"]`)?.focus();
+  list($("absent-list"), absent.map((s) => chip("absent", s.id, s.title, true, false, rows.get(s.id))));
 }
 
 function choose(name) {
   bench.state.chosen = name;
-  history.replaceState(null, "", `#${packed(bench.state)}`);
+  keepLink();
   showChain();
   showSource();
   showBars();
-  foundIn.ask(bench.state);
+  foundIn.ask(bench.state, serial);
 }
 
 // ---- the source that is looked at ----------------------------------------------------------------------------------------------
@@ -181,7 +192,7 @@ function showSource() {
     const box = el("input", { type: "checkbox", id: "on", checked: element.on, disabled: element.essential, onchange: () => turn(name, box.checked) });
     row.append(el("span", { class: "switch" }, box, el("label", { for: "on" }, element.essential ? "on (no frame is made without it)" : "on")));
     row.append(el("button", { type: "button", onclick: () => setAll(name, source, "typical") }, "typical"), el("button", { type: "button", onclick: () => setAll(name, source, "bound") }, "at the bound"));
-    if (element.changed.length) row.append(el("button", { type: "button", onclick: () => undo(name) }, "undo"));
+    row.append(el("button", { type: "button", id: "undo", disabled: !hasChanges(name), onclick: () => undo(name) }, "undo"));
     if (element.added) row.append(el("button", { type: "button", onclick: () => remove(name) }, "take out"));
   } else if (source.in_frames) {
     row.append(el("button", { type: "button", id: "add", onclick: () => add(source) }, "Put it into this camera"));
@@ -204,8 +215,11 @@ function showSource() {
 function set(key, value, box) {
   bench.state.set = { ...bench.state.set, [key]: value };
   box?.classList.add("changed");
+  if ($("undo")) $("undo").disabled = !hasChanges(bench.state.chosen);
   changed();
 }
+
+const hasChanges = (name) => Object.keys(bench.state.set ?? {}).some((key) => key.slice(0, key.lastIndexOf(".")) === name);
 
 function setAll(name, source, which) {
   const values = { ...bench.state.set };
@@ -298,10 +312,11 @@ function showLine(line) {
   if (line.kind === "error") { said(line.text); $("settling").textContent = ""; return; }
   if (line.error || line.overtaken) { if (line.error) said(line.error); return; }
   if (line.kind === "begin") bench.of = line.rows;
-  if (line.kind === "row") bench.rows.set(line.row.name, line.row);
+  if (line.kind === "row") { bench.rows.set(line.row.name, line.row); bench.shares = line.shares; }
   if (line.kind === "budget") {
     bench.budget = line.budget;
     bench.rows = new Map(line.budget.rows.map((r) => [r.name, r]));
+    bench.shares = line.budget.shares;
     bench.stale = false;
     if (bench.other) showOther();
     document.body.dataset.budget = String(Number(document.body.dataset.budget ?? 0) + 1);
@@ -326,7 +341,7 @@ function showHeadline() {
   const one = b.one_target_one_frame, pair = bench.before ? one.before_px : one.after_px;
   const parts = [el("div", { class: "big" }, ...["x", "y"].map((axis, k) => el("span", {}, el("i", {}, axis), px(pair[k]))))];
   parts.push(el("p", {}, bench.before ? "one target in one frame, without a calibration (k = 1)" : "one target in one frame, after calibration (k = 1)"));
-  parts.push(el("p", {}, `rms of x and y after calibration ${px(rms(one.after_px))}: between ${px(rms(one.least_px))} (only what is known) and ${px(rms(one.most_px))} (the rest at its bound)`));
+  parts.push(el("p", {}, `rms of x and y after calibration ${px(b.rms_px.after)}: between ${px(b.rms_px.least)} (only what is known) and ${px(b.rms_px.most)} (the rest at its bound)`));
   if (one.after_mm) parts.push(el("p", {}, `on the object: ${digits(one.after_mm[0], 2)} mm × ${digits(one.after_mm[1], 2)} mm`));
   const m = b.answer;
   if (m.frames > 1 || m.targets > 1) parts.push(el("p", {}, `mean over ${m.frames} frames and ${m.targets} targets: x ${px(m.after_px[0])}, y ${px(m.after_px[1])}`));
@@ -341,22 +356,22 @@ function simulated() {
   return `all sources of the chain at once, simulated in ${t.trials} windows: ${digits(t.total_px, 3)} ± ${digits(t.se_total_px, 1)} px, after a calibration ${digits(t.calibrated_px, 3)} ± ${digits(t.se_calibrated_px, 1)} px${bench.together.last ? "" : " …"}`;
 }
 
+const KINDS = ["constant", "smooth", "place", "time"], lines = new Map();
+
 function showBars() {
   const size = (r) => (bench.before ? r.before_px : r.after_px) || 0;
   const rows = [...bench.rows.values()].filter((r) => counted(r) && size(r) > 1e-6).sort((a, b) => size(b) - size(a)).slice(0, 24);
   const most = Math.max(...rows.map(size), 1e-12);
-  $("bars").replaceChildren(...rows.map((r) => {
-    const parts = bench.before ? r.before : r.after;
-    const bar = el("span", { class: "bar", "aria-hidden": "true" });
-    const squares = ["constant", "smooth", "place", "time"].map((n) => [n, (parts[`${n}_px`][0] ** 2 + parts[`${n}_px`][1] ** 2) / 2]);
-    const whole = squares.reduce((s, [, v]) => s + v, 0) || 1;
-    for (const [n, v] of squares) {
-      const piece = el("i", { class: n });
-      piece.style.width = `${((100 * size(r)) / most) * (v / whole)}%`;
-      bar.append(piece);
-    }
-    const words = squares.filter(([, v]) => v > 0.01 * whole).map(([n]) => n).join(", ");
-    return el("li", {}, el("button", { type: "button", "data-source": r.name, "aria-pressed": String(bench.state.chosen === r.name), title: `${r.status}; ${r.how}${r.reason ? `; ${r.reason}` : ""}`, "aria-label": `${r.title}: ${mpx(size(r))}, ${words}`, onclick: () => choose(r.name) }, el("span", {}, r.title), bar, el("em", {}, mpx(size(r)))));
+  list($("bars"), rows.map((r) => {
+    if (!lines.has(r.name)) lines.set(r.name, el("li", {}, el("button", { type: "button", "data-source": r.name, onclick: () => choose(r.name) }, el("span"), el("span", { class: "bar", "aria-hidden": "true" }, KINDS.map((n) => el("i", { class: n }))), el("em"))));
+    const item = lines.get(r.name), button = item.firstChild, [title, bar, number] = button.children, parts = (bench.before ? r.before : r.after)?.kinds ?? {};
+    KINDS.forEach((n, k) => { bar.children[k].style.width = `${((100 * size(r)) / most) * (parts[n] ?? 0)}%`; });
+    title.textContent = r.title;
+    number.textContent = mpx(size(r));
+    button.title = `${r.status}; ${r.how}${r.reason ? `; ${r.reason}` : ""}`;
+    button.setAttribute("aria-pressed", String(bench.state.chosen === r.name));
+    button.setAttribute("aria-label", `${r.title}: ${mpx(size(r))}, ${KINDS.filter((n) => parts[n] > 0.01).join(", ")}`);
+    return item;
   }));
 }
 
@@ -367,6 +382,7 @@ function fillChoices() {
   const group = (label, list) => el("optgroup", { label }, list.map((n) => el("option", { value: n }, n)));
   const given = names.filter((n) => n === "given");
   $("camera").replaceChildren(...(given.length ? [group("Of the command line", given)] : []), group("Presets", catalogue.presets), group("Data sheets", catalogue.sheets), el("optgroup", { label: "File" }, el("option", { value: "file", disabled: true }, "an opened file")));
+  $("other-camera").append(...names.map((n) => el("option", { value: n }, n)));
   $("note").append(...catalogue.notes.map((n) => el("option", { value: n.number }, `${n.number} ${n.title}`)));
   $("estimator").replaceChildren(...catalogue.estimators.map((n) => el("option", { value: n }, n.replaceAll("_", " "))));
 }
@@ -419,23 +435,35 @@ $("take").addEventListener("click", () => takeAway(bench));
 
 // ---- two cameras side by side --------------------------------------------------------------------------------------------------
 
-const otherFound = new Latest("found", (answer) => { bench.other.found = answer.found; showOther(); }, failed, "-beside");
-const otherPicture = new Latest("picture", (answer) => { bench.other.picture = answer.picture; showOther(); }, failed, "-beside");
+const forOther = (part) => (answer, asked) => { if (bench.other?.state === asked) { bench.other[part] = answer[part]; showOther(); } };
+const otherFound = new Latest("found", forOther("found"), failed, "-beside");
+const otherPicture = new Latest("picture", forOther("picture"), failed, "-beside");
 const otherBudget = new Follow("budget", (line) => {
   if (!bench.other) return;
   if (line.kind === "budget") bench.other.budget = line.budget;
-  if (line.kind === "row") bench.other.count = (bench.other.count ?? 0) + 1;
-  showOther();
-}, failed, "-beside");
+  if (line.kind === "row") bench.other.count++;
+  if (line.error || line.kind === "error") bench.other.problem = line.error ?? line.text;
+  if (line.kind !== "together") showOther();
+}, said, "-beside");
 
 let askingOther = null;
 
+// The budget beside is computed after that of the page.
 function askOther() {
   clearTimeout(askingOther);
-  if (!bench.budget || bench.stale) { askingOther = setTimeout(() => { if (bench.other) askOther(); }, 500); return; }
-  if (bench.other.budget) return;
+  if (!bench.other || bench.other.budget) return;
+  if (!bench.budget || bench.stale) { askingOther = setTimeout(askOther, 500); return; }
   bench.other.count = 0;
   otherBudget.ask(bench.other.state);
+}
+
+function setOther(state, name, budget = null) {
+  otherBudget.stop();
+  bench.other = { state, name, budget, count: 0 };
+  otherPicture.ask(state, state);
+  otherFound.ask(state, state);
+  askOther();
+  showOther();
 }
 
 $("compare").addEventListener("click", () => {
@@ -443,51 +471,65 @@ $("compare").addEventListener("click", () => {
     bench.other = null;
     otherBudget.stop();
     $("other").hidden = true;
-  } else {
-    bench.other = { state: structuredClone(bench.state), name: bench.camera?.name };
-    otherPicture.ask(bench.other.state);
-    otherFound.ask(bench.other.state);
-    if (bench.budget && !bench.stale) bench.other.budget = bench.budget;
-    askOther();
-    showOther();
+  } else if (bench.camera) {
+    setOther(structuredClone(bench.state), bench.camera.name, bench.stale ? null : bench.budget);
+    $("other").hidden = false;
+    $("other").scrollIntoView({ block: "nearest" });
   }
   $("compare").setAttribute("aria-pressed", String(Boolean(bench.other)));
   $("compare").textContent = bench.other ? "End comparing" : "Compare";
 });
 
+$("other-camera").addEventListener("change", () => {
+  const name = $("other-camera").value;
+  $("other-camera").value = "";
+  const measured = structuredClone({ scenario: bench.state.scenario ?? {}, scene: bench.state.scene ?? null, estimator: bench.state.estimator });
+  if (name) setOther({ camera: name, set: {}, ...measured, chosen: "" }, name);
+});
+$("swap").addEventListener("click", () => {
+  const mine = structuredClone(bench.state), theirs = bench.other.state, name = bench.camera.name, budget = bench.stale ? null : bench.budget;
+  begin(theirs);
+  setOther(mine, name, budget);
+});
+
 function showOther() {
-  const box = $("other"), o = bench.other;
+  const o = bench.other;
   if (!o) return;
-  box.hidden = false;
-  const parts = [el("h2", {}, `Beside it: ${o.name}`), el("p", { class: "hint" }, "This one stays as it was. Change the camera, a parameter or the estimator above, and compare.")];
-  const choice = el("select", { "aria-label": "The camera beside", onchange: () => { o.state = { camera: choice.value, set: {}, scenario: structuredClone(bench.state.scenario ?? {}), estimator: bench.state.estimator, chosen: "" }; o.name = choice.value; o.budget = null; otherPicture.ask(o.state); otherFound.ask(o.state); askOther(); } });
-  choice.append(el("option", { value: "" }, "another camera…"), ...bench.cameras.map((n) => el("option", { value: n }, n)));
-  parts.push(el("div", { class: "row" }, choice, el("button", { type: "button", onclick: () => { const mine = bench.state; const theirs = o.state; o.budget = null; o.state = structuredClone(mine); o.name = bench.camera.name; begin(theirs); otherPicture.ask(o.state); otherFound.ask(o.state); askOther(); } }, "Swap the two")));
-  const side = el("div", { class: "side" });
+  $("other-title").textContent = `Beside it: ${o.name}`;
+  const figure = el("figure");
   if (o.picture) {
     const made = screen(o.picture, `The target in ${o.name}; ${errorText(o.found)}`);
     drawFound(made.over, o.picture, o.found);
-    side.append(el("figure", {}, made.box, el("figcaption", {}, el("b", {}, o.name), " ", errorText(o.found))));
+    figure.append(made.box, el("figcaption", {}, el("b", {}, o.name), " ", errorText(o.found)));
   }
-  const table = el("table", {}, el("caption", {}, "One target in one frame, k = 1, rms of x and y"), el("thead", {}, el("tr", {}, ["", bench.camera?.name ?? "", o.name].map((t) => el("th", { scope: "col" }, t)))));
-  const body = el("tbody"), mine = bench.stale ? null : bench.budget?.one_target_one_frame, theirs = o.budget?.one_target_one_frame;
-  for (const [title, key] of [["before calibration", "before_px"], ["after calibration", "after_px"], ["only what is known", "least_px"], ["the rest at its bound", "most_px"]]) {
-    body.append(el("tr", {}, el("th", { scope: "row" }, title), ...[mine, theirs].map((one) => el("td", { class: "n" }, one ? px(rms(one[key])) : "…"))));
-  }
-  if (!theirs) parts.push(el("p", { class: "hint" }, `The budget of ${o.name} follows that of the camera above: ${o.count ?? 0} sources so far.`));
+  const mine = bench.stale ? null : bench.budget, theirs = o.budget;
+  const words = o.problem ?? (theirs ? (mine ? compared(mine, theirs) : "The budget of the camera above is being computed.") : `The budget of ${o.name} follows that of the camera above: ${o.count} sources so far.`);
+  const body = el("tbody");
+  const line = (title, values, shown) => body.append(el("tr", {}, el("th", { scope: "row" }, title), ...values.map((v) => el("td", { class: "n" }, v === undefined ? "…" : shown(v)))));
+  for (const [title, key] of [["before calibration", "before"], ["after calibration", "after"], ["only what is known", "least"], ["the rest at its bound", "most"]]) line(title, [mine, theirs].map((b) => b?.rms_px[key]), px);
   if (mine && theirs) {
-    const rows = new Map();
-    for (const [k, b] of [[0, bench.budget], [1, o.budget]]) for (const r of b.rows) if (counted(r)) (rows.get(r.source_id) ?? rows.set(r.source_id, { title: r.title, px: [0, 0] }).get(r.source_id)).px[k] = Math.hypot((rows.get(r.source_id)?.px[k]) ?? 0, r.after_px);
-    const apart = [...rows.values()].sort((a, b) => Math.abs(b.px[0] ** 2 - b.px[1] ** 2) - Math.abs(a.px[0] ** 2 - a.px[1] ** 2)).slice(0, 8);
     body.append(el("tr", {}, el("th", { scope: "row", colspan: 3 }, "The sources that make the difference, after calibration")));
-    for (const r of apart) if (r.px[0] !== r.px[1]) body.append(el("tr", {}, el("th", { scope: "row" }, r.title), ...r.px.map((v) => el("td", { class: "n" }, mpx(v)))));
-    const [a, b] = [rms(mine.after_px), rms(theirs.after_px)];
-    const better = Math.abs(a - b) < 0.01 * Math.max(a, b) ? "Both are alike." : `${a < b ? bench.camera.name : o.name} is better here: ${px(Math.min(a, b))} against ${px(Math.max(a, b))}.`;
-    parts.push(el("p", {}, el("b", {}, better)));
+    for (const r of apart(mine, theirs)) line(r.title, r.px, (v) => (v === null ? "–" : mpx(v)));
   }
-  table.append(body);
-  side.append(el("div", { class: "scroll" }, table));
-  box.replaceChildren(...parts, side);
+  const heading = el("tr", {}, ["", bench.camera?.name ?? "", o.name].map((t) => el("th", { scope: "col" }, t)));
+  $("other-body").replaceChildren(el("p", { id: "better" }, el("b", {}, words)), el("div", { class: "side" }, figure, el("div", { class: "scroll" }, el("table", {}, el("caption", {}, "One target in one frame, k = 1, rms of x and y"), el("thead", {}, heading), body))));
+}
+
+// The sources whose errors differ most; null where a camera has none of it.
+function apart(mine, theirs) {
+  const rows = new Map();
+  for (const [k, b] of [[0, mine], [1, theirs]]) for (const r of b.rows) if (counted(r)) {
+    if (!rows.has(r.name)) rows.set(r.name, { title: r.title, px: [null, null] });
+    rows.get(r.name).px[k] = r.after_px;
+  }
+  const far = (r) => Math.abs((r.px[0] ?? 0) ** 2 - (r.px[1] ?? 0) ** 2);
+  return [...rows.values()].filter((r) => r.px[0] !== r.px[1]).sort((a, b) => far(b) - far(a)).slice(0, 8);
+}
+
+function compared(mine, theirs) {
+  const [a, b] = [mine, theirs].map((x) => x.rms_px.after);
+  if (Math.abs(a - b) < 0.01 * Math.max(a, b)) return "Both are alike.";
+  return `${a < b ? bench.camera.name : bench.other.name} is better here: ${px(Math.min(a, b))} against ${px(Math.max(a, b))}.`;
 }
 
 $("camera").addEventListener("change", () => begin({ camera: $("camera").value, scenario: bench.state.scenario, estimator: bench.state.estimator, chosen: bench.state.chosen }));

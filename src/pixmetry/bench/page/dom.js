@@ -38,7 +38,6 @@ export function digits(value, count = 3) {
 
 export const mpx = (px) => (px === null || px === undefined ? "–" : `${digits(1000 * px, px >= 0.01 ? 3 : 2)} mpx`);
 export const px = (value) => `${digits(value, 2)} px`;
-export const rms = (pair) => Math.sqrt((pair[0] ** 2 + pair[1] ** 2) / 2);
 
 export function packed(state) {
   const bytes = new TextEncoder().encode(JSON.stringify(state));

@@ -69,8 +69,7 @@ export function errorText(found) {
   if (!found) return "";
   if (!found.found_px) return found.reason;
   const [x, y] = found.error_px;
-  const u = Math.sqrt((found.covariance_px2[0] + found.covariance_px2[2]) / 2);
-  return `error x ${digits(x, 3)} px, y ${digits(y, 3)} px; stated u ${px(u)}`;
+  return `error x ${digits(x, 3)} px, y ${digits(y, 3)} px; stated u ${px(found.u_px)}`;
 }
 
 // Lines over a common axis: ``lines`` are {x, y, name?}; ``marks`` are {x, name, text}.

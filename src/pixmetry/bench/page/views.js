@@ -13,12 +13,13 @@ const VIEWS = [
 
 let open = "", bench = null, move = null;
 const asks = {};
+const fill = (...parts) => $("view").replaceChildren(...parts);
 
 export function makeViews(page, moveState) {
   bench = page;
   move = moveState;
   const tabs = VIEWS.map(([id, title, path, draw], k) => {
-    asks[id] = new Latest(path, (answer) => { if (open === id) $("view").replaceChildren(...[draw(answer)].flat()); }, (text) => { if (open === id) $("view").replaceChildren(el("p", { class: "hint" }, text)); });
+    asks[id] = new Latest(path, (answer) => { if (open === id) draw(answer); }, (text) => { if (open === id) $("view").replaceChildren(el("p", { class: "hint" }, text)); });
     return el("button", { type: "button", role: "tab", id: `tab-${id}`, "aria-selected": "false", "aria-controls": "view", tabindex: k ? -1 : 0, onclick: () => show(open === id ? "" : id), onkeydown: step }, title);
   });
   $("tabs").replaceChildren(...tabs);
@@ -54,7 +55,7 @@ function evenFields(answer) {
     const made = screen(part.picture, `${title}, stretched`, part.stretched);
     return el("figure", {}, made.box, el("figcaption", {}, el("b", {}, title), ` mean ${digits(part.mean_dn, 4)} DN, standard deviation ${digits(part.std_dn, 3)} DN; black is ${digits(part.stretched[0], 4)}, white ${digits(part.stretched[1], 4)} DN`));
   };
-  return el("div", { class: "side" }, one(answer.flat, "Even field at half of saturation"), one(answer.dark, "Dark field"));
+  fill(el("div", { class: "side" }, one(answer.flat, "Even field at half of saturation"), one(answer.dark, "Dark field")));
 }
 
 function videoLine(answer) {
@@ -64,27 +65,35 @@ function videoLine(answer) {
   const [from, to] = [answer.video_us[0], answer.video_us.at(-1)];
   const steps = { x: [], y: [] }, pitch = (answer.pixel_us[1] - answer.pixel_us[0]) / 2;
   answer.pixel_us.forEach((t, k) => { if (t > from && t < to) { steps.x.push(t - pitch, t + pitch); steps.y.push(answer.pixel_dn[k], answer.pixel_dn[k]); } });
-  return [
+  fill(
     plot({ lines: [{ x: answer.video_us, y: answer.video_dn, name: "video" }, { x, y, name: "stored" }, { ...steps, name: "pixels of the sensor" }], xLabel: "time in the row / µs", yLabel: "DN", label: "Video of the row through the target against time", height: 220, zero: true }),
     el("p", { class: "hint" }, "The pixels of the sensor go onto the line; filters, cable and grabber make the video of them; the converter samples it. Noise and jitter of the line are at their means."),
-  ];
+  );
 }
 
+// The slider stays while the curves are drawn anew: it may be held.
 function hour(answer) {
   const now = answer.now_min.map((m) => Math.min(m, 60));
-  const slider = el("input", { type: "range", min: 0, max: 60, step: 1, id: "hour-slider", value: Math.round(Math.min(...now)) });
-  slider.addEventListener("input", () => { words.textContent = ` ${slider.value} min`; move({ camera_on_min: Number(slider.value), grabber_on_min: Number(slider.value) }); });
-  const words = el("span", {}, ` ${slider.value}${now[0] >= 60 ? " or more" : ""} min`);
-  return el("div", { class: "side" },
-    el("div", {}, plot({ lines: [{ x: answer.minutes, y: answer.x_px, name: "x" }, { x: answer.minutes, y: answer.y_px, name: "y" }], marks: [{ x: now[0], name: "true" }, { x: now[1], name: "found" }], xLabel: "time since switching on / min", yLabel: "px", label: "Where the target is seen, less where it is seen after an hour" }),
-      el("div", { class: "row" }, el("label", { for: "hour-slider" }, "Camera and grabber on for"), slider, words)),
-    el("div", {}, plot({ lines: [{ x: answer.minutes, y: answer.temperature_c }], xLabel: "time since switching on / min", yLabel: "sensor / °C", label: "Temperature of the sensor" }), el("p", { class: "hint" }, `At switching on the target is seen at x ${digits(answer.x_px[0], 3)} px, y ${digits(answer.y_px[0], 3)} px from where it is after an hour.`)));
+  const curves = [
+    el("div", {}, plot({ lines: [{ x: answer.minutes, y: answer.x_px, name: "x" }, { x: answer.minutes, y: answer.y_px, name: "y" }], marks: [{ x: now[0], name: "true" }, { x: now[1], name: "found" }], xLabel: "time since switching on / min", yLabel: "px", label: "Where the target is seen, less where it is seen after an hour" })),
+    el("div", {}, plot({ lines: [{ x: answer.minutes, y: answer.temperature_c }], xLabel: "time since switching on / min", yLabel: "sensor / °C", label: "Temperature of the sensor" })),
+  ];
+  const hint = `At switching on the target is seen at x ${digits(answer.x_px[0], 3)} px, y ${digits(answer.y_px[0], 3)} px from where it is after an hour. Lines: now, of the camera (blue) and of the grabber (orange).`;
+  if (!$("hour-slider")) {
+    const slider = el("input", { type: "range", min: 0, max: 60, step: 1, id: "hour-slider", oninput: () => { tell(); move({ camera_on_min: Number(slider.value), grabber_on_min: Number(slider.value) }); } });
+    const words = el("span"), tell = () => { words.textContent = ` ${slider.value} min`; };
+    slider.value = Math.round(Math.min(...now));
+    tell();
+    fill(el("div", { class: "row" }, el("label", { for: "hour-slider" }, "Camera and grabber on for"), slider, words), el("div", { class: "side", id: "hour-curves" }), el("p", { class: "hint", id: "hour-hint" }));
+  }
+  $("hour-curves").replaceChildren(...curves);
+  $("hour-hint").textContent = hint;
 }
 
 function overPixel(answer) {
   const lines = Object.entries(answer.errors_px).map(([name, y]) => ({ x: answer.place_px, y, name: name.replaceAll("_", " ") }));
-  return [plot({ lines, xLabel: "place of the target in the pixel / px", yLabel: "error of x / px", label: "Error of x while the target goes over a pixel", height: 200 }),
-    el("p", { class: "hint" }, "Every temporal noise is at its mean: what is left is the same in every frame. A good estimator gives a level line.")];
+  fill(plot({ lines, xLabel: "place of the target in the pixel / px", yLabel: "error of x / px", label: "Error of x while the target goes over a pixel", height: 200 }),
+    el("p", { class: "hint" }, "Every temporal noise is at its mean: what is left is the same in every frame. A good estimator gives a level line."));
 }
 
 let timer = 0;
@@ -124,8 +133,8 @@ function exposedRows(answer) {
     if (!still) timer = requestAnimationFrame(draw);
   };
   let still = matchMedia("(prefers-reduced-motion: reduce)").matches;
-  const button = el("button", { type: "button", onclick: () => { still = !still; button.textContent = still ? "play" : "pause"; if (!still) timer = requestAnimationFrame(draw); } }, still ? "play" : "pause");
+  const button = el("button", { type: "button", onclick: () => { still = !still; button.textContent = still ? "play" : "pause"; stopAnimation(); if (!still) timer = requestAnimationFrame(draw); } }, still ? "play" : "pause");
   stopAnimation();
   setTimeout(() => draw(performance.now()));
-  return [el("div", { class: "side" }, chart, scene), el("div", { class: "row" }, button, el("span", { class: "hint" }, answer.moves ? "Rows that look now are tinted: even rows blue, odd rows red." : "Nothing moves in this scenario: give the target a speed under Motion."))];
+  fill(el("div", { class: "side" }, chart, scene), el("div", { class: "row" }, button, el("span", { class: "hint" }, answer.moves ? "Rows that look now are tinted: even rows blue, odd rows red." : "Nothing moves in this scenario: give the target a speed under Motion.")));
 }
