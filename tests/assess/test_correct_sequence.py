@@ -154,11 +154,12 @@ def test_frames_without_light_stay_as_they_are() -> None:
 def test_rows_keep_no_offset_that_a_gain_or_a_mixture_has_changed(changed: dict[str, dict[str, object]], rng: np.random.Generator) -> None:
     """Covered columns tell the offsets of rows as they are stored, behind gain and mixture; frames made without the package.
 
-    Of 20 DN the noise of 24 covered columns leaves 4/√24 DN, times √(1 + 0.4²)/0.6 where frames are mixed.
+    Of 20 DN (evenly spread, so that no covered pixel is below code 0: 1.4 times −34.6 DN, and noise) the noise of 24 covered columns leaves
+    4/√24 DN, times √(1 + 0.4²)/0.6 where frames are mixed.
     """
     gain = 1 + 0.4 * np.cos(1.1 * np.arange(FRAMES)) if "electronics__agc" in changed else np.ones(FRAMES)
     light = np.pad(rng.uniform(600, 900, SHAPE), ((0, 0), (0, 24)))
-    offset = 20.0 * rng.standard_normal((FRAMES, SHAPE[0], 1))
+    offset = 20.0 * rng.uniform(-np.sqrt(3), np.sqrt(3), (FRAMES, SHAPE[0], 1))
     seen = gain[:, None, None] * (light + offset + 4.0 * rng.standard_normal((FRAMES, *light.shape)))
     for k in range(1, FRAMES if "processing__temporal_noise_reduction" in changed else 0):
         seen[k] = 0.4 * seen[k - 1] + 0.6 * seen[k]

@@ -211,16 +211,21 @@ def test_reasons_of_bad_set_ups(rng: np.random.Generator):
     assert covered_pixels([], False, None) is None
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.5, 3.0])
-def test_offsets_of_rows_never_make_a_frame_worse(rng: np.random.Generator, noise: float):
-    """The variance of the rows after it: less than before, and at most 1.03 of before where there is no row noise."""
+@pytest.mark.parametrize(("noise", "most"), [(0.0, 1.003), (0.5, 1.0), (3.0, 0.72)])
+def test_offsets_of_rows_never_make_a_frame_worse(rng: np.random.Generator, noise: float, most: float):
+    """The variance of a frame after it over that before, in 80 frames: less than 1, and at most 1.003 where rows have no offset.
+
+    Of 12 covered pixels 4²/12 DN² of noise is in each offset. Shrunk by the optimal share, 0.0113 ± 0.0029 DN² are added to 16 where there
+    is nothing to find, 0.0226 ± 0.0031 of 0.25 taken away where rows are off by 0.5 DN (8.4 % more pixels' variance without the share,
+    6.8 % more in these), and 7.73 ± 0.13 of 8.9 where they are off by 3: 7 to 8 standard deviations from what is asserted.
+    """
     before = after = 0.0
-    for _ in range(12):
+    for _ in range(80):
         offset = noise * rng.standard_normal(ROWS)
         frame = BLACK + offset[:, None] + rng.normal(0, 4, (ROWS, COLS))
         found = row_and_column_offsets(frame, BORDERS)["row_offset_dn"]
         own = offset[BORDERS.active(frame.shape)[0]]
         before += float((own - own.mean()).var())
         after += float((own - own.mean() - found).var())
-    pixels = 12 * 4.0**2
-    assert (after + pixels) / (before + pixels) < (1.03 if noise == 0 else 1.0 if noise < 1 else 0.75)
+    pixels = 80 * 4.0**2
+    assert (after + pixels) / (before + pixels) < most
