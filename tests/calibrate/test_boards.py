@@ -95,14 +95,16 @@ def test_another_board_and_a_mirrored_one_are_refused(rng: np.random.Generator) 
 
 @pytest.mark.parametrize(("rings", "grid"), [("RING_8", (5, 3)), ("RING_14", (5, 4)), ("RING_20", (4, 3))])
 def test_printed_rings_are_read_with_their_numbers(rings: str, grid: tuple[int, int], rng: np.random.Generator) -> None:
-    """Tilted and rolled: each target that is read has the number that the print's table gives for its place, and most are read (the
-    ellipse of a disc beside segments does not always converge); as rings of 12 segments they are
-    refused, with the name of those that are there."""
+    """Tilted and rolled: each target that is read has the number that the print's table gives for its place, and all or all but one are
+    read; as rings of 12 segments they are refused, with the name of those that are there.
+
+    Half of the pixels of discs were once taken for those of the wall's corners, which are long: up to 4 of 12 were lost, others 0.7 px off.
+    """
     board = board_of("coded", grid, 1.0, dictionary=rings)
     view = View(((grid[0] - 1) / 2, (grid[1] - 1) / 2), 1.8 * grid[0], float(rng.uniform(0, 360)), 20, -15)
     frame = seen(board, view, rng, 1.0)
     found = observations_of([frame], "coded", dictionary=rings, least_images=1)
-    assert set(found.points) <= set(board.points) and len(found.points) >= 0.5 * len(board.points)
+    assert set(found.points) <= set(board.points) and len(found.points) >= 0.8 * len(board.points)
     expected = view.image(np.array([board.points[name] for name in found.points]))
     seen_at = np.column_stack([found.x_px, found.y_px])[np.argsort(found.point)]
     assert np.abs(seen_at - expected).max() < 0.3  # with the eccentricity of an ellipse; the next target is 40 px away

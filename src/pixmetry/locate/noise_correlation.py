@@ -26,6 +26,7 @@ NEAR_PX = 3  # within which pixels are alike in proportion to their noise, as fi
 FAR_PX = 12  # from here on what rows and columns share is the same at all distances
 CLEAR_SIGMA = 4.0  # by which noise must differ from that of independent pixels (6e-5 by chance)
 CLASSES = 5  # sizes of targets whose gains are computed
+CODED = 20  # targets that are sent through a coder, of all sizes together
 ALIKE = 1.1  # ratio of sizes that are one
 UNLIKE = 1.5  # ratio of the variances of targets and ground from which their noise may be of another kind
 SAMPLE, LARGE_SAMPLE = 24, 80  # targets whose residuals are looked at then; where they share a shape that is not the template's
@@ -308,17 +309,21 @@ def with_correlation(
     good = good[np.argsort(size[good], kind="stable")]
     count = 1 if size[good[-1]] < ALIKE * size[good[0]] else min(CLASSES, len(good))
     picked = good[np.rint((np.arange(count) + 0.5) / count * len(good) - 0.5).astype(int)]
-    drawn = [drawn_target(frame, targets, positions, i, kind, aperture_px) for i in picked]
+
+    def drawn_of(chosen: np.ndarray) -> list[Drawn]:
+        return [drawn_target(frame, targets, positions, i, kind, aperture_px) for i in chosen]
 
     def sample(most: int) -> list[Drawn]:
         some = good[np.unique(np.linspace(0, len(good) - 1, min(len(good), most)).round().astype(int))]
-        return [drawn_target(frame, targets, positions, i, kind, aperture_px) for i in some]
+        return drawn_of(some)
 
     if known is None:
         assert coder is not None
         before = noise_before(frame, coder, regions, boxes)
-        spreads, why = _of_coder(before, coder, noise, drawn, sample(SAMPLE), fitted), BY_CODER
+        groups = [drawn_of(part[:: -(-len(part) * count // CODED)]) for part in np.array_split(good, count)]
+        spreads, why = _of_coder(before, coder, noise, groups, sample(SAMPLE), fitted), BY_CODER
     else:
+        drawn = drawn_of(picked)
         level = float(np.median(noise.variance_dn2(targets.background_dn[good] + 0.5 * targets.amplitude_dn[good])))
         some = [] if 1 / UNLIKE < level / known.variance_dn2 < UNLIKE else sample(SAMPLE)
         shared = shared_shape(some, noise) if fitted and noise.origin == "image" else None
@@ -352,22 +357,32 @@ def with_correlation(
     return changed, float(np.median(np.sqrt(0.5 * (fx + fy))[good])), why
 
 
-def _of_coder(before: float, coder: Coder, noise: NoiseModel, drawn: list[Drawn], some: list[Drawn], fitted: bool) -> list[Spread]:
-    """Spreads of templates that went through the coder after the noise ``before``; wider where more is left at some than it leaves."""
+def _of_coder(
+    before: float, coder: Coder, noise: NoiseModel, groups: list[list[Drawn]], some: list[Drawn], fitted: bool
+) -> list[Spread]:
+    """Spreads of groups of templates that went through the coder after the noise ``before``; wider where more is left than it leaves."""
     if not fitted and np.isfinite(before):
-        return [coder_spread(one, noise, coder, before)[0] for one in drawn]
+        return [_through_coder(group, noise, coder, before)[0] for group in groups]
     shared = shared_shape(some, noise)
     seen = some if shared is None else [shared.without(one) for one in some]
     left = sum(float((one.residual**2 / noise.variance_dn2(one.mean)).sum()) for one in seen)
     left /= sum(max(float(one.mask.sum()) - len(one.jacobian), 1.0) for one in seen)
     if not np.isfinite(before):  # no ground: as much as leaves what is left at the targets
-        middle, low, before = drawn[len(drawn) // 2], 0.0, float(np.sqrt(left * noise.constant_dn2))
+        middle, low, before = groups[len(groups) // 2][0], 0.0, float(np.sqrt(left * noise.constant_dn2))
         for _ in range(HALVINGS):
             half = 0.5 * (low + before)
             low, before = (half, before) if coder_spread(middle, noise, coder, half)[1] < left else (low, half)
-    through = [coder_spread(one, noise, coder, before) for one in drawn]
+    through = [_through_coder(group, noise, coder, before) for group in groups]
     beyond = max(1.0, left / float(np.mean([residual for _, residual in through])))
     return [replace(spread, factor=spread.factor * beyond) for spread, _ in through]
+
+
+def _through_coder(group: list[Drawn], noise: NoiseModel, coder: Coder, before: float) -> tuple[Spread, float]:
+    """What `coder_spread` tells of like templates: medians, for by its few draws and its place in the pixel one tells it to 10 to 30 %."""
+    each = [coder_spread(one, noise, coder, before) for one in group]
+    count = min(len(spread.factor) for spread, _ in each)  # slopes are unknowns of some only
+    factor: np.ndarray = np.median([spread.factor[:count] for spread, _ in each], axis=0)
+    return replace(each[0][0], factor=factor), float(np.median([residual for _, residual in each]))
 
 
 def _of_shared_shape(noise: NoiseModel, known: Correlation, shared: SharedShape, drawn: list[Drawn], some: list[Drawn]) -> list[Spread]:

@@ -62,6 +62,7 @@ class About(NamedTuple):
     home: Array  # shape (n, 2 or more): x, y, px
     half: Ints  # half sides of the windows
     outer: Array  # longest half axes, px
+    inverse: Array  # shape (n, 3): xx, yy and xy of the symmetric matrix that makes the outline a circle of radius 1, 1/px
     reach: Array  # shape (n, 2): how far beyond them pixels are used, and are taken from a neighbour, px
     near_start: Ints  # the neighbours of target i are near_index[near_start[i]:near_start[i + 1]]
     near_index: Ints
@@ -279,12 +280,22 @@ def normal_equations(images: Array, residual: Array, weight: Array, used: Ints, 
 
 
 @jit
+def beyond(inverse: Array, i: int, dx: float, dy: float) -> float:
+    """Distance of a place from the outline of target i, to first order; negative inside it."""
+    qx, qy = inverse[i, 0] * dx + inverse[i, 2] * dy, inverse[i, 2] * dx + inverse[i, 1] * dy
+    rho = math.sqrt(qx * qx + qy * qy)
+    gx, gy = inverse[i, 0] * qx + inverse[i, 2] * qy, inverse[i, 2] * qx + inverse[i, 1] * qy
+    steep = math.sqrt(gx * gx + gy * gy)
+    return (rho - 1.0) * rho / steep if steep > 0.0 else -1.0 / max(abs(inverse[i, 0]), abs(inverse[i, 1]))
+
+
+@jit
 def cut_out(frame: NDArray[np.generic], about: About, noise: Noise, which: Ints, packed: Packed, quality: Array) -> None:
     """Copy the windows of the targets ``which``.
 
     The mask is 0 outside the frame, beyond the reach of the target and where a neighbour is nearer. ``quality``: 1, 6, 7 and 8 of `Fits`.
     """
-    start, half, outer, reach, near_start, near_index = about
+    start, half, outer, inverse, reach, near_start, near_index = about
     place, data, mask = packed
     low, high = noise.low_dn, noise.high_dn
     for w in range(len(which)):
@@ -312,9 +323,8 @@ def cut_out(frame: NDArray[np.generic], about: About, noise: Noise, which: Ints,
                     continue
                 own = True
                 for j in near:
-                    ex, ey = x - start[j, 0], y - start[j, 1]
-                    e = math.sqrt(ex * ex + ey * ey) - outer[j]
-                    if e < reach[j, 1] or e < math.sqrt(dx * dx + dy * dy) - outer[i]:
+                    e = beyond(inverse, j, x - start[j, 0], y - start[j, 1])
+                    if e < reach[j, 1] or e < beyond(inverse, i, dx, dy):
                         own = False
                         break
                 if own:

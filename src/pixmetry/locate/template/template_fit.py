@@ -17,6 +17,7 @@ from pixmetry.locate.template._template_kernels import LEAST_ELECTRONS, MOST_ELE
 KINDS = ("disc", "ellipse", "ring", "spot")  # in the order of the kernels' codes
 REACH = 3.5  # standard deviations of the edge, the pixel included, up to which pixels around a target are used
 NEAR = 3.2  # the same within which a pixel is a neighbour's
+POINT_PX = 1e-3  # radius of a spot's outline
 SMALL_PX, SHARP_PX, FAR_TOO_LARGE = 2.5, 0.3, 2.0  # size, blur and χ² per degree of freedom of a second start
 BLUR = -7  # place of the blur among the parameters
 SUSPECT_SIGMA = 3.0  # by which χ² must exceed the usual for pixels to be looked at one by one
@@ -72,7 +73,7 @@ class Windows:
             from pixmetry.locate.template.template_fit import efficiency as of_sigma
 
             efficiency = of_sigma(math.sqrt(noise.constant_dn2) / noise.slope_dn)
-        about = kernels.About(start, half, outer, reach, *near)
+        about = kernels.About(start, half, outer, _inverse(start, outer, kind), reach, *near)
         return cls(frame, noise, KINDS.index(kind), float(aperture_px), surface, efficiency, start, about)
 
     @property
@@ -138,6 +139,16 @@ def start_values(targets: Targets, kind: str, aperture_px: float) -> tuple[np.nd
         shape = [outer, np.sqrt(np.maximum(outer**2 - area / math.pi, (0.2 * outer) ** 2))]
     rest = np.zeros((4, len(targets)))
     return np.stack([targets.x_px, targets.y_px, *shape, blur, amplitude, background, *rest], axis=1), outer, edge
+
+
+def _inverse(start: np.ndarray, outer: np.ndarray, kind: str) -> np.ndarray:
+    """Inverse of the matrices of the outlines, xx, yy and xy: of ellipses that of their shape, of all others a circle's."""
+    if kind != "ellipse":
+        across = 1.0 / np.maximum(outer, POINT_PX)
+        return np.stack([across, across, np.zeros(len(start))], axis=1)
+    xx, yy, xy = start[:, 2:5].T
+    det = xx * yy - xy * xy
+    return np.stack([yy / det, xx / det, -xy / det], axis=1)
 
 
 def run_fit(
