@@ -27,6 +27,7 @@ SHAPE = (96, 160)
 CORRECTING = [i for i, s in sources().items() if s.correct is not None]
 # see test_correct_sequence
 IN_A_SEQUENCE = ("sensor.image_lag", "processing.temporal_noise_reduction", "electronics.agc", "optics.flicker")
+BY_SHIFTS = ("sensor.pixel_aperture",)  # see test_correct_finer
 BY_BORDERS = ("electronics.row_noise", "electronics.column_noise")  # see test_covered
 X_PX, Y_PX = (v.ravel() + 0.3 + 0.37 * np.arange(v.size) % 1 for v in np.meshgrid(np.arange(20.0, 150, 30), np.arange(20.0, 90, 25)))
 DIGITAL, ANALOGUE = "imx264_like", "pulnix_tm6cn_epix_pixelclock"
@@ -119,7 +120,7 @@ def places_of(frames_dn: np.ndarray, threshold: float) -> np.ndarray:
     return np.array(out)
 
 
-@pytest.mark.parametrize("source_id", [i for i in CORRECTING if i not in ("grabber.adc", *IN_A_SEQUENCE, *BY_BORDERS)])
+@pytest.mark.parametrize("source_id", [i for i in CORRECTING if i not in ("grabber.adc", *IN_A_SEQUENCE, *BY_BORDERS, *BY_SHIFTS)])
 def test_every_correction_is_reached_and_takes_its_error_out_of_the_whole_chain(source_id: str) -> None:
     """Against the same camera without the source; both frames are rounded, so that 0.41 DN of difference stay (√(2/12)).
 

@@ -11,7 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from pixmetry.assess.finer import APERTURE, FinerImage, finer_camera, finer_image
 from pixmetry.camera.camera import Camera, Element, load_camera
+from pixmetry.camera.catalogue import sources
 from pixmetry.camera.conversions import SAMPLE, LineSources
 from pixmetry.camera.covered import Covered
 from pixmetry.camera.line import Line
@@ -48,6 +50,7 @@ SUPPLY = {
     "column_offset_dn": "optically black rows above or below the image (covered in the camera's facts), in frames stored with them",
     "factor_rel": f"{LEAST_FRAMES} frames or more in a row (--sequence, in Python sequence=True), in parts of which nothing changes",
 }
+OF_SHIFTS = "several frames of a scene at rest, shifted by parts of a pixel: say how (--shifts, in Python shifts=)"
 SURFACE_DEGREE, SMALLEST = 4, 12  # of the light of a flat field, and the rows and columns that it needs
 LEAST_RESPONSE = 0.1  # of a pixel that is divided by it; one with less is a defect
 MOST_CLIPPED = 0.01  # of the values of dark or flat frames: hot pixels
@@ -167,6 +170,8 @@ def _reason(element: Element, maps: Mapping[str, np.ndarray], only: tuple[str, .
     needs = MAP_OF.get(source.id)
     if source.correct is None:
         return f"not corrected: {source.reasons['correct']}"
+    if source.id == APERTURE:
+        return f"not corrected: needs {OF_SHIFTS}"
     if source.produces is Kind.CODES:
         return ""  # what goes on is in DN
     if element.name in skip or (only and not named):
@@ -295,6 +300,8 @@ class Correction:
         Pixels that were stored at an end of the range: what is behind them is not known, and their values are limits.
     clipped_pixels : int
         How many these are, in all frames.
+    finer : FinerImage, optional
+        Of shifted frames: the image that they give together, which is then the only one of ``frames``.
     """
 
     sources: Mapping[str, str]
@@ -303,6 +310,7 @@ class Correction:
     steps: tuple[FrameCorrection, ...] = ()
     clipped: np.ndarray | None = None
     clipped_pixels: int = 0
+    finer: FinerImage | None = None
 
     def __repr__(self) -> str:
         done = [name for name, text in self.sources.items() if text.startswith("corrected")]
@@ -328,6 +336,8 @@ def correct(
     skip: Iterable[str] = (),
     raw: str | RawLayout | None = None,
     sequence: bool = False,
+    shifts: Any = None,
+    finer: Any = None,
     progress: Progress | None = None,
 ) -> Correction:
     """Correct frames with what is known of their camera.
@@ -361,6 +371,12 @@ def correct(
         the next one (``sensor.image_lag``, ``processing.temporal_noise_reduction``) is corrected, from the second frame on; and what makes
         the frames, or their rows, unequally bright (``electronics.agc``, ``optics.flicker``), by the parts of the scene that stay as they
         are.
+    shifts : array_like of shape (n, 2), or path, or "found", optional
+        The frames are of one scene at rest, and the image is displaced by this in each of them, along x and y in pixels: put them together
+        on a finer grid (``sensor.pixel_aperture``). A path names a table (CSV) with the columns ``shift_x_px`` and ``shift_y_px``, a row
+        for each frame in their order; ``"found"`` finds the shifts in the frames, against the first.
+    finer : int or (int, int), optional
+        Finer pixels in a pixel, 1 to 4 (along x and y). By default the finest grid that the shifts part.
     progress : callable, optional
         Called with (what, done, of).
 
@@ -391,12 +407,16 @@ def correct(
     elif output is None:
         remedy = "name one, or give the frames as an array"
         raise InputError("the folder for the corrected frames is missing", where="output", remedy=remedy)
+    if shifts is None and finer is not None:
+        raise InputError("a finer grid needs shifted frames", where="finer", value=finer, remedy="say how they are shifted (shifts)")
     layout = layout_of(raw)
     known = known_of(with_, dark=dark, flat=flat, defects=defects, settings=settings, only=only, skip=skip, raw=layout)
     if isinstance(frames, np.ndarray):
-        return _correct_array(frames, known, sequence)
+        made = _correct_array(frames, known, sequence)
+        return made if shifts is None else _put_together(made, known, shifts, finer)
     assert output is not None
-    return _correct_files([frames] if isinstance(frames, str | Path) else frames, known, Path(output), layout, progress, sequence)
+    files = [frames] if isinstance(frames, str | Path) else frames
+    return _correct_files(files, known, Path(output), layout, progress, sequence, shifts, finer)
 
 
 @dataclass(frozen=True)
@@ -670,6 +690,19 @@ def _correct_array(frames: np.ndarray, known: Known, sequence: bool = False) -> 
     return Correction(_together(said), out, steps=said[shown] if said else (), clipped=clipped, clipped_pixels=int(clipped.sum()))
 
 
+def _put_together(made: Correction, known: Known, shifts: Any, finer: Any) -> Correction:
+    """Corrected frames as one on a finer grid."""
+    assert made.frames is not None
+    found = finer_image(made.frames, known.camera, shifts, finer)
+    name = next((e.name for e in known.camera.active if e.source.id == APERTURE), APERTURE)
+    source = sources()[APERTURE]
+    does = (getdoc(source.correct) or "").partition("\n")[0]
+    step = FrameCorrection(name, source.title, True, f"corrected: {found.text}", does, source.leaves, found.noise_rel)
+    steps = (*(s for s in made.steps if s.name != name), step)
+    said = {**{key: text for key, text in made.sources.items() if key != name}, name: step.text}
+    return replace(made, sources=said, frames=found.image_dn[None], steps=steps, finer=found)
+
+
 def _correct_files(
     frames: Sequence[str | Path],
     known: Known,
@@ -677,6 +710,8 @@ def _correct_files(
     layout: RawLayout | None,
     progress: Progress | None,
     sequence: bool = False,
+    shifts: Any = None,
+    finer: Any = None,
 ) -> Correction:
     from tifffile import imwrite
 
@@ -710,6 +745,7 @@ def _correct_files(
 
     said: list[tuple[FrameCorrection, ...]] = []
     clipped: dict[str, int] = {}
+    kept: list[np.ndarray] = []  # of shifted frames
     of = [*known.files, *dict.fromkeys(path if path.is_dir() else path.parent for path in map(Path, frames))]
     with staged_output(output, "correction", of, [*files, *known.files]) as folder:
         if name:
@@ -723,9 +759,17 @@ def _correct_files(
             if at_ends:
                 clipped[path.name] = at_ends
             hashes.add(path, loaded.sha256, loaded.size_bytes)
-            imwrite(folder / f"{_stem(path)}.tif", data.astype(np.float32))
+            if shifts is None:
+                imwrite(folder / f"{_stem(path)}.tif", data.astype(np.float32))
+            else:
+                kept.append(data.astype(np.float32))
             told("correcting frames", i + 1, len(files))
         correction = Correction(_together(said), output=output, steps=said[shown], clipped_pixels=sum(clipped.values()))
+        if shifts is not None:
+            correction = replace(_put_together(replace(correction, frames=np.array(kept)), known, shifts, finer), frames=None)
+            assert correction.finer is not None
+            imwrite(folder / "finer.tif", correction.finer.image_dn)
+            finer_camera(known.camera, correction.finer).save(folder / "camera.yaml")
         record = {
             "schema": "pixmetry/correction/1",
             "unit": "DN above black",
@@ -733,6 +777,7 @@ def _correct_files(
             "steps": {step.name: step.to_record() for step in correction.steps},
             "noise_rel": None if np.isnan(correction.noise_rel) else correction.noise_rel,
             "clipped_pixels": clipped,
+            **({} if correction.finer is None else {"finer": correction.finer.to_record()}),
             "provenance": provenance_record(hashes),
         }
         write_json(folder / "correction.json", record)

@@ -46,6 +46,13 @@ IN_POSITIONS = ("positions are", "coordinates are", "pixmetry corrected")  # in 
     is_flag=True,
     help="The frames were taken one after the other, without a pause: correct what one leaves in the next, and gains that differ.",
 )
+@click.option(
+    "--shifts",
+    metavar="TABLE|found",
+    help="The frames are of one scene, shifted by parts of a pixel: put them together on a finer grid. A table with shift_x_px and "
+    "shift_y_px of each frame, or `found` to find them in the frames.",
+)
+@click.option("--finer", metavar="N|NxM", help="With --shifts: finer pixels in a pixel, up to 4. Default: the most that the shifts allow.")
 @click.option("--threads", type=click.IntRange(1), help="Number of threads. Default: one for each processor.")
 def correct(
     frames: tuple[Path, ...],
@@ -60,6 +67,8 @@ def correct(
     listed: bool,
     raw: str | None,
     sequence: bool,
+    shifts: str | None,
+    finer: str | None,
     threads: int | None,
 ) -> None:
     """Correct frames with what is known of their camera.
@@ -88,11 +97,16 @@ def correct(
         return
     with shown_progress() as progress:
         correction = run(
-            frames, camera, output, **maps, settings=asked, only=only, skip=skip, raw=raw, sequence=sequence, progress=progress
-        )
+            frames, camera, output, **maps, settings=asked, only=only, skip=skip, raw=raw, sequence=sequence, shifts=shifts, finer=finer,
+            progress=progress,
+        )  # fmt: skip
     print_steps(correction.steps, correction.sources)
     if correction.clipped_pixels:
         echo(f"{correction.clipped_pixels} pixels were stored at an end of the range: what is behind them is not known")
+    if correction.finer is not None:
+        (x, y), pitch = correction.finer.origin_px, correction.finer.pitch_um
+        size = "" if pitch is None else f", pitch {pitch[0]:.4g} × {pitch[1]:.4g} µm"
+        echo(f"the first finer pixel lies at x {x:.4g}, y {y:.4g} px of the frames{size}; camera.yaml has its size, pitch and noise")
     echo(f"corrected frames: {output}")
 
 

@@ -7,13 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 
+from pixmetry.camera.finer_grid import BORDER_PX, FINER_KEY, LEAST_CONTRAST, SHIFT_KEY, ShiftedFrames
 from pixmetry.camera.geometry import image_shift
 from pixmetry.camera.light import Pull
 from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
+from pixmetry.core.errors import InputError
 from pixmetry.core.number import Estimates
-from pixmetry.core.random import Stream
+from pixmetry.core.random import Grid, Stream
 
 
 class PixelAperture(Parameters):
@@ -60,6 +62,34 @@ def measure(observations: Observations) -> Estimates:
     return replace(found, values=np.minimum(found.values, 1.0))
 
 
+def transfer(params: PixelAperture, fx: np.ndarray, fy: np.ndarray) -> np.ndarray:
+    """Complex contrast that the rectangle leaves to frequencies along x and y, in cycles per pixel."""
+    turn = np.exp(2j * np.pi * (params.offset_x_px * fx + params.offset_y_px * fy))
+    return np.asarray(np.sinc(params.width_x_px * fx) * np.sinc(params.width_y_px * fy) * turn)
+
+
+def correct(params: PixelAperture, signal: Signal, maps: Mapping[str, np.ndarray]) -> Signal:
+    """Part the frequencies that shifted frames fold together, on a finer grid, and divide them by the transfer of the sensitive area.
+
+    ``maps`` holds the shifts of the frames, shape (n, 2), and the pixels of the finer grid in a pixel along x and y.
+
+    Raises
+    ------
+    InputError
+        If there are no shifts, or these do not part the frequencies.
+    """
+    missing = [key for key in (SHIFT_KEY, FINER_KEY) if key not in maps]
+    if missing:
+        remedy = "take several frames of a scene at rest, shifted by parts of a pixel, and give their shifts (--shifts)"
+        raise InputError(f"the correction needs {missing[0]!r} of these frames", where="sensor.pixel_aperture", remedy=remedy)
+    finer = int(maps[FINER_KEY][0]), int(maps[FINER_KEY][1])
+    rows, cols = signal.data.shape[1:]
+    grid = ShiftedFrames(np.asarray(maps[SHIFT_KEY], float), finer, (rows, cols))
+    image, _ = grid.restored(signal.data, lambda fx, fy: transfer(params, fx, fy))
+    one = signal.take(np.zeros(1, np.int64))
+    return replace(one, data=image[None].astype(np.float32), grid=Grid.whole([0], image.shape), frame_shape=image.shape)
+
+
 SOURCE = Source(
     id="sensor.pixel_aperture",
     title="Light-sensitive area smaller than the pitch",
@@ -75,6 +105,7 @@ SOURCE = Source(
     bound=PixelAperture(width_x_px=0.4, width_y_px=0.6),
     forward=forward,
     measure=measure,
+    correct=correct,
     truth=truth,
     gum_class="F",
     equation="s = I ∗ box(a_x, a_y) at the pixel;  MTF = |sinc(a ν)|;  periodic error a₁ = |H'(1)|/(π H(0))",
@@ -82,11 +113,14 @@ SOURCE = Source(
     references=(
         "S. K. Park, R. Schowengerdt, M.-A. Kaczynski, Modulation-transfer-function analysis for sampled image systems, "
         "Applied Optics 23 (1984) 2572–2582",
+        "R. Y. Tsai, T. S. Huang, Multiframe image restoration and registration, Advances in Computer Vision and Image Processing 1 (1984) "
+        "317–339",
     ),
-    advice="Widen the target's image to a spread of 0.6 px or more, or take a sensor with microlenses.",
+    advice="Widen the target's image to a spread of 0.6 px or more, or take a sensor with microlenses. A scene at rest: put frames "
+    "together that are shifted by parts of a pixel (pixmetry correct --shifts).",
+    leaves=f"frequencies to which the area leaves a contrast below {LEAST_CONTRAST:g} (a full pixel: about 1 and 2 cycles per pixel), "
+    f"detail beyond the finer grid, and a border of {BORDER_PX} pixels",
     reasons={
-        "correct": "light between the sensitive areas is recorded nowhere: images that differ there alone give the same frame. Frames "
-        "that are shifted by parts of a pixel can be interleaved instead",
         "propagate": "it only changes the undersampling; that needs the spread in front of the pixel, which the probe does not contain",
     },
 )
