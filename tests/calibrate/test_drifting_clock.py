@@ -75,13 +75,14 @@ def test_without_a_scale_per_image_the_report_names_the_pattern(network: Network
 def test_with_one_the_residuals_are_noise_and_the_clock_is_found(network: Network) -> None:
     """Scales against those of the clock: χ² of the images less one, failing by chance once in a million; an error of 5 u is seen.
 
-    The uncertainty of a target by its own covariance is right to 20 % (the chain has errors that are not noise: fields, dark signal).
+    The uncertainty of a target by its own covariance is right to 20 % (the chain has errors that are not noise: fields, dark signal;
+    the low pass and the echoes of its video line are alike at all dots, and once made it up to twice too large).
     """
     origin = -LOCK_US * 10.0  # samples at 10 MHz from where the clock is locked
     network = replace(network, per_image=("x_scale",), scale_origin_px=origin)
     calibration = calibrate_network(network, Options(field="fixed", folds=0))
     residuals = calibration.tests.residuals["tm6cn"]
-    assert residuals.rms_x_px < 1.2 * residuals.noise_x_px
+    assert 0.8 < residuals.rms_x_px / residuals.noise_x_px < 1.2 and 0.8 < residuals.rms_y_px / residuals.noise_y_px < 1.2
     assert not any(f.kind == "x_scale_drift" and f.level == "warning" for f in calibration.findings)
     images = calibration.tests.images
     scale, u = np.array([i.x_scale for i in images]), np.array([i.u_x_scale for i in images])

@@ -120,6 +120,15 @@ def sharpened(mean: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return values + 0.6 * (values - gaussian_filter(values, 1.0))
 
 
+def echoed(mean: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """A cable that is not terminated: 5 % of the signal comes again two pixels later, behind a low pass along the rows.
+
+    All targets are shifted alike by it.
+    """
+    signal = gaussian_filter(mean, (0.0, 0.6))
+    return white(signal + 0.05 * (np.roll(signal, 2, axis=1) - signal), rng)
+
+
 def clipped_float(mean: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """A float picture whose top was cut off at 170 DN of 190."""
     return np.minimum(white(mean, rng), 170.0)

@@ -42,6 +42,8 @@ class Drawn:
         What it leaves of the frame, DN; 0 outside of the mask.
     away_px : ndarray, shape (side, side)
         Distance from the outline along the line to the centre, of a spot from the centre.
+    turn_rad : ndarray, shape (side, side)
+        Direction from the centre, from x towards y.
     height_dn : float
     """
 
@@ -50,6 +52,7 @@ class Drawn:
     mask: np.ndarray
     residual: np.ndarray
     away_px: np.ndarray
+    turn_rad: np.ndarray
     height_dn: float
 
     def gains(self, noise: NoiseModel) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -99,4 +102,4 @@ def drawn_target(frame: np.ndarray, targets: Targets, positions: Positions, i: i
     elif kind != "spot":
         away = away - local["radius_px"]
     height = abs(local["amplitude_dn"]) if kind != "spot" else float(np.abs(mean - local["background_dn"]).max())
-    return Drawn(mean, jacobian[used], mask, np.where(mask, seen - mean, 0.0), away, max(height, 1e-30))
+    return Drawn(mean, jacobian[used], mask, np.where(mask, seen - mean, 0.0), away, np.arctan2(down, across), max(height, 1e-30))

@@ -317,6 +317,7 @@ def with_correlation(
         some = good[np.unique(np.linspace(0, len(good) - 1, min(len(good), most)).round().astype(int))]
         return drawn_of(some)
 
+    relief: np.ndarray | float = 1.0
     if known is None:
         assert coder is not None
         before = noise_before(frame, coder, regions, boxes)
@@ -330,6 +331,7 @@ def with_correlation(
         if shared is not None:
             some = sample(LARGE_SAMPLE)
             spreads, why = _of_shared_shape(noise, known, shared_shape(some, noise) or shared, drawn, some), BY_SHAPE
+            relief = _relief(positions, good, noise)
         elif any(differs_clearly(one, noise, known) for one in drawn):
             alike = residual_correlation(some, noise) if some else None
             spreads, why = [spread_of(one, noise, known, alike) for one in drawn], BY_NEIGHBOURS
@@ -340,8 +342,8 @@ def with_correlation(
     def over_sizes(values: list[float]) -> np.ndarray:
         return np.interp(np.log(np.maximum(size, 1e-3)), at, values)
 
-    factors = {name: over_sizes([float(s.factor[k]) for s in spreads]) for k, name in enumerate(PARAMETERS[kind])}
-    fx, fy, cross = factors["x_px"], factors["y_px"], over_sizes([s.cross for s in spreads])
+    factors = {name: relief * over_sizes([float(s.factor[k]) for s in spreads]) for k, name in enumerate(PARAMETERS[kind])}
+    fx, fy, cross = factors["x_px"], factors["y_px"], relief * over_sizes([s.cross for s in spreads])
     phase = np.nan_to_num(positions.more.get("s_curve_px", np.zeros(len(size)))) ** 2
     vx, vy = positions.var_x_px2 - phase, positions.var_y_px2 - phase
     both = positions.cov_xy_px2 * np.sqrt(fx * fy) + cross * np.sqrt(vx * vy)
@@ -357,6 +359,15 @@ def with_correlation(
     return changed, float(np.median(np.sqrt(0.5 * (fx + fy))[good])), why
 
 
+def _relief(positions: Positions, good: np.ndarray, noise: NoiseModel) -> np.ndarray:
+    """What the variances of poor fits, which hold the residuals, are to be multiplied by where all targets share their usual χ²."""
+    chi2 = positions.more["chi2_per_dof"]
+    usual = max(1.0, float(np.median(chi2[good])))
+    widened = (positions.flags & Flag.POOR_FIT != 0) & (noise.row_shift_px == 0) & (noise.field_shift_px == 0)
+    relief: np.ndarray = np.where(widened, np.maximum(chi2 / usual, 1.0) / np.maximum(chi2, 1.0), 1.0)
+    return relief
+
+
 def _of_coder(
     before: float, coder: Coder, noise: NoiseModel, groups: list[list[Drawn]], some: list[Drawn], fitted: bool
 ) -> list[Spread]:
@@ -364,7 +375,7 @@ def _of_coder(
     if not fitted and np.isfinite(before):
         return [_through_coder(group, noise, coder, before)[0] for group in groups]
     shared = shared_shape(some, noise)
-    seen = some if shared is None else [shared.without(one) for one in some]
+    seen = some if shared is None else shared.rest
     left = sum(float((one.residual**2 / noise.variance_dn2(one.mean)).sum()) for one in seen)
     left /= sum(max(float(one.mask.sum()) - len(one.jacobian), 1.0) for one in seen)
     if not np.isfinite(before):  # no ground: as much as leaves what is left at the targets
@@ -387,7 +398,7 @@ def _through_coder(group: list[Drawn], noise: NoiseModel, coder: Coder, before: 
 
 def _of_shared_shape(noise: NoiseModel, known: Correlation, shared: SharedShape, drawn: list[Drawn], some: list[Drawn]) -> list[Spread]:
     """Spreads by the noise that is left beside what all targets share, and by how that moves them at their places in the pixels."""
-    rest, sigmas = [shared.without(one) for one in some], [shared.sigma_dn(one, noise) for one in some]
+    rest, sigmas = shared.rest, [shared.sigma_dn(one, noise) for one in some]
     level = float(np.mean([np.median(s[one.mask]) for s, one in zip(sigmas, some, strict=True)])) ** 2
     alike = None if 1 / UNLIKE < level / known.variance_dn2 < UNLIKE else residual_correlation(rest, noise, sigmas)
     count = min(len(one.jacobian) for one in (*some, *drawn))  # slopes are unknowns of some only
