@@ -121,8 +121,9 @@ def test_a_coder_that_leaves_nothing_of_a_target_does_not_make_it_certain() -> N
     """A spot of 3 DN, of which a JPEG of quality 20 leaves an even block wherever it lies: u was 1e-16 px, for nothing moves it."""
     v, u = np.indices((11, 11)) - 5.0
     shape = np.exp(-(u**2 + v**2) / 2)
+    away, turn = np.hypot(u, v), np.arctan2(v, u)
     drawn = Drawn(
-        40 + 3 * shape, np.stack([3 * u * shape, 3 * v * shape, shape]), np.ones((11, 11), bool), np.zeros((11, 11)), np.hypot(u, v), np.arctan2(v, u), 3.0
+        40 + 3 * shape, np.stack([3 * u * shape, 3 * v * shape, shape]), np.ones((11, 11), bool), np.zeros((11, 11)), away, turn, 3.0
     )
     spread, _ = coder_spread(drawn, NoiseModel(1.0), Coder(0, 0, steps(20).astype(float)), 0.1)
     assert (spread.factor[:2] == 1).all()
