@@ -317,3 +317,72 @@ def test_a_camera_file_of_ones_own_is_read_and_a_foreign_one_refused(server: Any
     assert post(server, "/camera", {"record": record}).json()["name"] == "mine"
     for wrong in ("", "a: [", "schema: pixmetry/scene/1\n", "schema: pixmetry/camera/1\nname: x\n", 5):
         assert set(post(server, "/read", {"text": wrong}).json()) == {"error"}
+
+
+# ---- a scene file ----------------------------------------------------------------------------------------------------------------------
+
+SCENES: dict[str, dict[str, Any]] = {
+    "lattice": {"uniform": {"level_photons": 200.0}, "discs": {"lattice_px": 40.0, "diameter_px": 9.0, "peak_photons": 9000.0}},
+    "moving": {
+        "targets": [{"kind": "disc", "x_px": 300.0, "y_px": 200.2, "diameter_px": 8.0, "peak_photons": 9000.0}],
+        "motion": {"velocity_px_per_s": [100.0, 0.0]},
+    },
+    "field": {"uniform": {"level_photons": 5000.0}},
+}
+DIAMETERS = {"lattice": 9.0, "moving": 8.0}
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_a_scene_file_is_seen_as_simulate_sees_it(server: Any, tmp_path: Path, name: str) -> None:
+    from pixmetry import read_frame
+    from pixmetry.core.config import dump_yaml
+
+    scene = {"schema": "pixmetry/scene/1"} | SCENES[name]
+    state = {"camera": "imx264_like", "scene": scene, "side_px": 64, "seed": 2, "x_px": 310.0, "y_px": 190.0}
+    answer = post(server, "/picture", state).json()
+    picture = answer["picture"]
+    dump_yaml(scene, tmp_path / "scene.yaml")
+    window = ",".join(str(picture[k]) for k in ("row0", "col0", "rows", "cols"))
+    pictured = tmp_path / "pictured.yaml"
+    pictured.write_text(post(server, "/away", state).json()["pictured.yaml"])
+    words = ["simulate", str(pictured), str(tmp_path / "scene.yaml"), "-o", str(tmp_path / "f"), "--seed", "2", "--window", window]
+    done = CliRunner().invoke(main, words)
+    assert done.exit_code == 0, done.output
+    assert np.array_equal(read_frame(tmp_path / "f" / "frame_00000.tif"), codes_of(picture))
+    targets = json.loads((tmp_path / "f" / "truth.json").read_text())["targets"]
+    found = post(server, "/found", state).json()["found"]
+    if name == "field":
+        assert answer["true_px"] is None and not targets and found["reason"] == "the scene has no target"
+    else:
+        x, y = (answer["true_px"][k] - picture[n] for k, n in enumerate(("col0", "row0")))
+        (nearest,) = [t for t in targets if np.hypot(t["x_px"] - x, t["y_px"] - y) < 1e-6]
+        assert found["error_px"] is not None and np.hypot(*found["error_px"]) < 0.2 and nearest["diameter_px"] == DIAMETERS[name]
+    assert "stay where they are" in post(server, "/pixel", state).json()["error"]
+
+
+def test_scene_and_cameras_of_the_command_line_are_told_apart(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from pixmetry.bench import job
+
+    scene = tmp_path / "scene.yaml"
+    scene.write_text(yaml_text({"schema": "pixmetry/scene/1"} | SCENES["lattice"]))
+    begun: list[Any] = []
+    monkeypatch.setattr(job, "_serve", lambda app_with, port, tell: begun.append(app_with("t", 1)))
+    monkeypatch.setattr("pixmetry.bench.server.app_of", lambda shelf, token, own, given, first: (given, first))
+    for words, cameras in (([str(scene)], ()), (["imx264_like", str(scene)], ("imx264_like",)), (["imx264_like"], ("imx264_like",))):
+        done = CliRunner().invoke(main, ["bench", "--no-open", *words])
+        assert done.exit_code == 0, done.output
+        given, first = begun.pop()
+        assert given == cameras and ("scene" in first) == (len(words) > len(cameras))
+        if "scene" in first:
+            assert first["scenario"]["target"]["diameter_px"] == 9.0
+    scene.write_text(yaml_text({"schema": "pixmetry/scene/1", "photon_transfer": {"brightest_photons": 1000.0}}))
+    refused = CliRunner().invoke(main, ["bench", "--no-open", str(scene)])
+    assert refused.exit_code != 0 and "not one picture" in refused.output
+
+
+def test_a_scene_that_is_too_much_is_refused(server: Any) -> None:
+    pose = {"principal_distance_px": 1000.0, "z_mm": 1000.0}
+    plate = {"kind": "dots", "rows": 1000, "columns": 1000, "diameter_mm": 0.5, "pose": pose}
+    for scene in ({"plate": plate}, {"discs": {"lattice_px": 4.0}}, {}, {"photon_transfer": {"brightest_photons": 1000.0}}):
+        reply = post(server, "/picture", {"camera": "imx264_like", "scene": {"schema": "pixmetry/scene/1"} | scene}).json()
+        assert set(reply) == {"error"}

@@ -56,7 +56,8 @@ class Found:
 
     Parameters
     ----------
-    true_px : (float, float)
+    true_px : (float, float) or None
+        None if the scene has no target.
     found_px : (float, float) or None
         None if no target was found near the true place.
     covariance_px2 : (float, float, float) or None
@@ -66,7 +67,7 @@ class Found:
         Why there is none.
     """
 
-    true_px: tuple[float, float]
+    true_px: tuple[float, float] | None
     found_px: tuple[float, float] | None = None
     covariance_px2: tuple[float, float, float] | None = None
     flags: str = ""
@@ -75,7 +76,8 @@ class Found:
     @property
     def error_px(self) -> tuple[float, float] | None:
         """Found less true."""
-        return None if self.found_px is None else (self.found_px[0] - self.true_px[0], self.found_px[1] - self.true_px[1])
+        found, true = self.found_px, self.true_px
+        return None if found is None or true is None else (found[0] - true[0], found[1] - true[1])
 
     def to_record(self) -> dict[str, Any]:
         """Return the plain record."""
@@ -103,8 +105,10 @@ def picture_of(layout: Layout, kept: KeptSteps, quiet: bool = False, go_on: Call
     return Picture(codes.astype(np.uint8 if bits <= 8 else np.uint16), window[0], window[1], bits)
 
 
-def found_in(picture: Picture, layout: Layout, true_px: tuple[float, float]) -> Found:
+def found_in(picture: Picture, layout: Layout, true_px: tuple[float, float] | None) -> Found:
     """The target in a picture, as ``pixmetry locate`` finds it in the window as a file."""
+    if true_px is None:
+        return Found(None, reason="the scene has no target")
     try:
         found = locate(picture.codes, estimator=layout.state.estimator, bits=picture.bits)
     except InputError as problem:

@@ -15,13 +15,14 @@ from pixmetry.bench.controls import camera_record, catalogue_record
 from pixmetry.bench.gate import AHEAD, Gate, GoOn, Overtaken, Refused
 from pixmetry.bench.picture import found_in, picture_of, without_chosen
 from pixmetry.bench.result import Result
-from pixmetry.bench.state import BenchState, Shelf, read_state
+from pixmetry.bench.state import BenchState, Shelf, budget_target, read_state
 from pixmetry.bench.take_away import taken_away
 from pixmetry.bench.views import even_fields, exposed_rows, hour, over_a_pixel, video_line
 from pixmetry.bench.worker import finite
 from pixmetry.camera.kept_steps import KeptSteps
 from pixmetry.core.config import parse_yaml
 from pixmetry.core.errors import InputError, PixmetryError
+from pixmetry.scene.files import read_scene
 
 if TYPE_CHECKING:
     from starlette.applications import Starlette
@@ -226,13 +227,15 @@ def app_of(shelf: Shelf, token: str, port: int, given: tuple[str, ...] = (), fir
         return StreamingResponse(all_lines(), media_type="application/x-ndjson")
 
     async def read(request: Request) -> Response:
-        """The record of a camera file or a data sheet that the page sends as text."""
+        """The record of a camera file, a data sheet or a scene file that the page sends as text."""
         try:
             text = (await desk.sent(request)).get("text")
             record = dict(parse_yaml(text if isinstance(text, str) else "", "the file"))
-            state = read_state({"record": record})
-            await gate.run(_page_of(request), "read", lambda go_on: shelf.laid_out(state))
-            return JSONResponse({"record": record})
+            scene = record.get("schema") == "pixmetry/scene/1"
+            sent = {"scene": read_scene(record).model_dump(mode="json", by_alias=True, exclude_unset=True)} if scene else {"record": record}
+            state = read_state(sent)
+            like = await gate.run(_page_of(request), "read", lambda go_on: budget_target(shelf.laid_out(state)))
+            return JSONResponse({"scene": state.scene, "target": like} if scene else {"record": record})
         except (PixmetryError, Refused, Overtaken) as problem:
             return _problem(problem)
 

@@ -29,6 +29,7 @@ Name = Annotated[str, Field(max_length=120)]
 Value = bool | int | float | Annotated[str, Field(max_length=120)]
 Names = Annotated[tuple[Name, ...], Field(max_length=100)]
 MOST_PHOTONS = 1e9  # of a scene
+MOST_TARGETS = 20_000  # of a scene's lattice or plate
 MOST_KEPT = 64  # cameras of which something is kept
 OFF_CENTRE_PX = (0.3, -0.4)  # of the target, from the middle of the frame: no place that is special for the pixels
 
@@ -51,6 +52,7 @@ class BenchState(Model):
     set: dict[Name, Value] = Field(default_factory=dict, max_length=500, description="changed values by NAME.PARAMETER, or of the camera")
     on: Names = Field(default=(), description="sources to switch on that are off in the camera")
     off: Names = Field(default=(), description="sources to switch off")
+    scene: dict[str, Any] | None = Field(default=None, description="what is looked at, as a scene file; not given: one disc")
     scenario: dict[Name, dict[Name, Value | None]] = Field(default_factory=dict, max_length=20)
     x_px: float | None = Field(default=None, ge=0, le=1e5, description="place of the target; not given: near the middle")
     y_px: float | None = Field(default=None, ge=0, le=1e5)
@@ -203,14 +205,34 @@ class Layout:
     @property
     def place(self) -> tuple[float, float]:
         """Of the target in the scene's plane."""
+        return self._looked_at if self.state.scene is None else self.target_at(0.0) or self._looked_at
+
+    @property
+    def _looked_at(self) -> tuple[float, float]:
         rows, cols = self.camera.frame_shape
         x, y = self.state.x_px, self.state.y_px
         return (cols // 2 + OFF_CENTRE_PX[0] if x is None else x, rows // 2 + OFF_CENTRE_PX[1] if y is None else y)
 
     @cached_property
+    def _nearest(self) -> int | None:
+        """Which target of a scene file is looked at: the one nearest to the place that the state names."""
+        (x, y), targets = self._looked_at, self.seen.targets(0.5 * self.camera.exposure_s, 0) if hasattr(self.seen, "targets") else []
+        far = {k: (t["x_px"] - x) ** 2 + (t["y_px"] - y) ** 2 for k, t in enumerate(targets) if "x_px" in t}
+        return min(far, key=far.__getitem__) if far else None
+
+    def target_at(self, time_s: float) -> tuple[float, float] | None:
+        """Where in the scene's plane the target is that is looked at; None if the scene has none."""
+        if self._nearest is None:
+            return None
+        target = self.seen.targets(time_s, 0)[self._nearest]
+        return target["x_px"], target["y_px"]
+
+    @cached_property
     def scene(self) -> dict[str, Any]:
         """The scene as its file holds it."""
-        target, (x, y) = self.setting.target, self.place
+        if self.state.scene is not None:
+            return self.state.scene
+        target, (x, y) = self.setting.target, self._looked_at
         full = self.full_photons
         scene: dict[str, Any] = {
             "schema": "pixmetry/scene/1",
@@ -230,21 +252,42 @@ class Layout:
 
     @cached_property
     def seen(self) -> Any:
-        """The scene."""
-        return build_scene(read_scene(self.scene), self.camera.frame_shape, "scene")
+        """The scene.
+
+        Raises
+        ------
+        InputError
+            If it is a series, or has more targets than a page can show at once.
+        """
+        model, (rows, cols) = read_scene(self.scene), self.camera.frame_shape
+        if model.photon_transfer is not None:
+            raise InputError("a photon-transfer series is not one picture", where="scene", remedy="give its uniform field alone")
+        lattice = 0 if model.discs is None or model.discs.lattice_px is None else rows * cols / model.discs.lattice_px**2
+        plate = 0 if model.plate is None else model.plate.rows * model.plate.columns
+        if max(lattice, plate) > MOST_TARGETS:
+            raise InputError("the scene has too many targets for the bench", where="scene", allowed=f"up to {MOST_TARGETS}")
+        return build_scene(model, self.camera.frame_shape, "scene")
 
     @cached_property
-    def true_px(self) -> tuple[float, float]:
-        """Where the target's centre lies in the frame; of one that moves, in the middle of the exposure."""
-        (target,) = self.seen.targets(0.5 * self.camera.exposure_s, 0)
-        x, y = self.camera.true_positions(target["x_px"], target["y_px"], 0, self.state.seed)
+    def true_px(self) -> tuple[float, float] | None:
+        """Where the target's centre lies in the frame; of one that moves, in the middle of the exposure; None without a target."""
+        target = self.target_at(0.5 * self.camera.exposure_s)
+        return None if target is None else self._in_frame(target)
+
+    def _in_frame(self, place: tuple[float, float]) -> tuple[float, float]:
+        x, y = self.camera.true_positions(*place, 0, self.state.seed)
         return float(x[0]), float(y[0])
+
+    @cached_property
+    def middle_px(self) -> tuple[float, float]:
+        """Where the page looks: at the target, else at the place that the state names."""
+        return self._in_frame(self._looked_at) if self.true_px is None else self.true_px
 
     @cached_property
     def window(self) -> tuple[int, int, int, int]:
         """First row and column, rows and columns of the part of the frame that is shown."""
         rows, cols = self.camera.output_shape
-        x, y = self.true_px
+        x, y = self.middle_px
         if not (-0.5 <= x <= cols - 0.5 and -0.5 <= y <= rows - 0.5):
             where, remedy = f"x {x:.5g}, y {y:.5g} px", "move it, or the frame"
             raise InputError("the target lies outside of the frame", value=where, allowed=f"{cols} × {rows} px", remedy=remedy)
@@ -252,3 +295,26 @@ class Layout:
         row0 = min(max(round(y) - height // 2, 0), rows - height)
         col0 = min(max(round(x) - width // 2, 0), cols - width)
         return row0, col0, height, width
+
+
+def budget_target(layout: Layout) -> dict[str, float]:
+    """What a scenario says of a target that is like the one that is looked at: of a disc of one size and blur, else nothing."""
+    model = read_scene(layout.scene)
+    if model.discs is not None and layout.state.scene is not None:
+        diameter, blur, peak = model.discs.diameter_px, model.discs.blur_px, model.discs.peak_photons
+    else:
+        discs = [t for t in model.targets if t.kind == "disc"]
+        if not discs or model.plate is not None:
+            return {}
+        diameter, blur, peak = discs[0].diameter_px, model.blur_px, discs[0].peak_photons
+    dark = 0.0 if model.uniform is None else model.uniform.level_photons
+    told = {"diameter_px": diameter, "blur_px": blur, "peak_rel": peak / layout.full_photons, "background_rel": dark / layout.full_photons}
+    fields = Scenario().target
+    found = {}
+    for name, value in told.items():
+        try:
+            type(fields).model_validate({name: value})
+        except ValueError:
+            continue  # beyond what a budget knows of: its own value stays
+        found[name] = float(value)
+    return found

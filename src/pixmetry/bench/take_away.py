@@ -17,6 +17,7 @@ def taken_away(layout: Layout) -> dict[str, str]:
     row0, col0, rows, cols = layout.window
     window, bits = f"{row0},{col0},{rows},{cols}", stored_bits(layout.camera)
     estimator = "" if state.estimator == "auto" else f" --estimator {state.estimator}"
+    true = "true: {!r}, {!r}".format(*layout.true_px) if layout.true_px else "the scene has no target"
     scenario = {"schema": "pixmetry/scenario/1"} | {k: dict(v) for k, v in state.scenario.items() if v}
     commands = f"""\
 # the picture, and the centre found in it (add {col0} to its x and {row0} to its y)
@@ -31,7 +32,7 @@ import pixmetry
 frames = pixmetry.simulate("pictured.yaml", "scene.yaml", "frames", seed={state.seed}, window=({row0}, {col0}, {rows}, {cols}))
 frame = pixmetry.read_frame(frames / "frame_00000.tif")
 found = pixmetry.locate(frame, estimator={state.estimator!r}, bits={bits})
-print(found.x_px + {col0}, found.y_px + {row0})  # true: {layout.true_px[0]!r}, {layout.true_px[1]!r}
+print(found.x_px + {col0}, found.y_px + {row0})  # {true}
 budget = pixmetry.budget("camera.yaml", "scenario.yaml", estimator={state.estimator!r})
 print(budget.one.after_px)
 """

@@ -72,7 +72,7 @@ def video_line(layout: Layout, kept: KeptSteps) -> dict[str, Any]:
     at_us = 1e6 * ((grid.col0[0] + np.arange(seen.size) + 0.5) / fine.sample_clock_hz + line.start_s)
     sampled_us = 1e6 * ((first + np.arange(49) + 0.5) / line.sample_clock_hz + line.start_s)
     codes = picture_of(layout, kept)
-    own = codes.codes[_row_in(codes, layout.true_px[1])]
+    own = codes.codes[_row_in(codes, layout.middle_px[1])]
     columns = range(first - codes.col0, first - codes.col0 + 49)
     stored = [int(own[c]) if 0 <= c < len(own) else None for c in columns]
     return {
@@ -113,7 +113,14 @@ def over_a_pixel(shelf: Shelf, state: BenchState, kept: KeptSteps, go_on: Callab
     """Error of the chosen estimator, and of the template, while the target goes over a pixel along x; every temporal draw at its mean.
 
     ``go_on`` is called now and then; it raises to end the work.
+
+    Raises
+    ------
+    InputError
+        If the scene is that of a file.
     """
+    if state.scene is not None:
+        raise InputError("the targets of a scene file stay where they are", remedy="use one target in place of the scene")
     layout = shelf.laid_out(state)
     x0, y0 = layout.place
     places = np.linspace(-0.5, 0.5, PLACES)
@@ -151,14 +158,13 @@ def exposed_rows(layout: Layout) -> dict[str, Any]:
     times = np.linspace(float(begin.min()), float(end.max()), 25)
     path = []
     for t in times:
-        (target,) = layout.seen.targets(float(t), 0)
-        path.append((float(target["x_px"]), float(target["y_px"])))
+        path.append(layout.target_at(float(t)) or layout.place)
     return {
         "row0": row0,
         "begin_ms": (1e3 * begin).tolist(),
         "end_ms": (1e3 * end).tolist(),
         "time_ms": (1e3 * times).tolist(),
         "path_px": path,
-        "moves": layout.setting.moves,
+        "moves": len(set(path)) > 1,
         "diameter_px": layout.setting.target.diameter_px,
     }

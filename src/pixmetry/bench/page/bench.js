@@ -272,7 +272,7 @@ function showScenario() {
       const value = camera.scenario[`${part}.${c.name}`];
       return control({ ...c, value, unit: unitOf(c.name) }, (v) => setScenario(part, c.name, v), { title: plainName(c.name), key: `${part}.${c.name}` }).box;
     });
-    if (part === "target") made.push(...placeControls());
+    if (part === "target") made.unshift(...sceneNote()), made.push(...placeControls());
     return el("details", { open: part === "target" }, el("summary", {}, PARTS[part] ?? part), made);
   });
   const own = catalogue.own.map((c) => control({ ...c, value: camera.own[c.name] }, (v) => set(c.name, v), { title: plainName(c.name), key: c.name }).box);
@@ -283,10 +283,17 @@ function showScenario() {
   for (const d of $("scenario").children) if (open.has(d.firstChild.textContent)) d.open = true;
 }
 
+// With a scene file, the picture is of that file; what is said of the target is for the budget alone.
+function sceneNote() {
+  if (!bench.state.scene) return [];
+  const back = () => begin({ ...bench.state, scene: null, x_px: null, y_px: null });
+  return [el("p", { class: "hint", id: "of-a-file" }, "The picture shows the scene file. Light, target and motion here are those of the budget. ", el("button", { type: "button", onclick: back }, "One target in place of the scene"))];
+}
+
 function placeControls() {
   const { cols, rows, place_px: at } = bench.camera;
   return [["x_px", cols - 1, at[0]], ["y_px", rows - 1, at[1]]].map(([name, high, value]) =>
-    control({ name, kind: "float", low: 0, high, unit: "px", text: "place in the scene", value }, (v) => { bench.state[name] = v; changed(); }, { title: plainName(name), key: name }).box);
+    control({ name, kind: "float", low: 0, high, unit: "px", text: bench.state.scene ? "the nearest target is shown" : "place in the scene", value }, (v) => { bench.state[name] = v; changed(); }, { title: plainName(name), key: name }).box);
 }
 
 const UNITS = { px: "px", mm: "mm", s: "s", hz: "Hz", nm: "nm", deg: "°", min: "min", k: "K", s2: "s²" };
@@ -425,8 +432,10 @@ $("file").addEventListener("change", async () => {
   if (!file) return;
   try {
     if (file.size > 400000) throw new Error("the file is too large for a camera file");
-    const { record } = await once("read", { text: await file.text() });
-    begin({ record, scenario: bench.state.scenario, estimator: bench.state.estimator });
+    const { record, scene, target } = await once("read", { text: await file.text() });
+    const { scenario, estimator } = bench.state;
+    if (scene) begin({ ...bench.state, scene, scenario: { ...scenario, target: { ...scenario?.target, ...target } }, x_px: null, y_px: null });
+    else begin({ record, scenario, estimator, scene: bench.state.scene });
   } catch (problem) {
     said(`${file.name}: ${problem.message}`);
   }
@@ -532,9 +541,9 @@ function compared(mine, theirs) {
   return `${a < b ? bench.camera.name : bench.other.name} is better here: ${px(Math.min(a, b))} against ${px(Math.max(a, b))}.`;
 }
 
-$("camera").addEventListener("change", () => begin({ camera: $("camera").value, scenario: bench.state.scenario, estimator: bench.state.estimator, chosen: bench.state.chosen }));
+$("camera").addEventListener("change", () => begin({ camera: $("camera").value, scene: bench.state.scene, scenario: bench.state.scenario, estimator: bench.state.estimator, chosen: bench.state.chosen }));
 $("estimator").addEventListener("change", () => { bench.state.estimator = $("estimator").value; changed(); });
-$("reset").addEventListener("click", () => { bench.state = { camera: bench.state.camera, record: bench.state.record, chosen: bench.state.chosen, set: {}, scenario: {} }; showState(); });
+$("reset").addEventListener("click", () => { bench.state = { camera: bench.state.camera, record: bench.state.record, scene: bench.state.scene, chosen: bench.state.chosen, set: {}, scenario: {} }; showState(); });
 $("side").addEventListener("change", () => { bench.state.side_px = Number($("side").value); changed(); });
 for (const which of ["before", "after"]) $(which).addEventListener("click", () => {
   bench.before = which === "before";

@@ -36,7 +36,7 @@ export function screen(picture, label, stretched = null) {
 // True and found centre, the ellipse of the found one and the error, both enlarged.
 export function drawFound(over, picture, found) {
   over.replaceChildren();
-  if (!found) return;
+  if (!found?.true_px) return;
   const at = (p) => [p[0] - picture.col0, p[1] - picture.row0];
   const size = picture.cols / 40;
   const cross = (p, name) => {
