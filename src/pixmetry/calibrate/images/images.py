@@ -11,7 +11,9 @@ import numpy as np
 
 from pixmetry.calibrate.bundle.model import CameraModel
 from pixmetry.calibrate.bundle.network import Network
-from pixmetry.calibrate.images.numbering import asymmetric_turns, consistent
+from pixmetry.calibrate.images.looks import Looks, by_marks, together
+from pixmetry.calibrate.images.numbering import Board, asymmetric_turns, consistent, quarters_between
+from pixmetry.calibrate.images.parts import numbered_parts
 from pixmetry.calibrate.images.targets import DICTIONARIES, KINDS, NUMBERED, Seen, Wanted, board_size, see
 from pixmetry.camera.camera import Camera
 from pixmetry.core.errors import InputError, MeasureError
@@ -54,6 +56,8 @@ class ImageObservations:
     left_out : tuple of (str, str)
         Names of the images that are not used, and why.
     findings : tuple of Finding
+    plate : Looks, optional
+        Of a plate of dots: the marks by which it was numbered.
     """
 
     kind: str
@@ -70,6 +74,7 @@ class ImageObservations:
     normal: np.ndarray | None = None
     left_out: tuple[tuple[str, str], ...] = ()
     findings: tuple[Finding, ...] = ()
+    plate: Looks | None = None
 
     def __len__(self) -> int:
         return len(self.x_px)
@@ -108,6 +113,7 @@ def observations_of(
     raw: str | RawLayout | None = None,
     noise: NoiseModel | Camera | str | Path | None = None,
     dictionary: str | None = None,
+    plate: Looks | None = None,
     least_images: int = LEAST_IMAGES,
     threads: int | None = None,
     progress: Progress | None = None,
@@ -124,8 +130,8 @@ def observations_of(
         plate of separate squares; coded targets anywhere; inner corners of a chessboard whose bright squares hold markers; corners of a
         grid of AprilTags.
     grid : "COLSxROWS" or (cols, rows), optional
-        Of inner corners, dots, separate squares or tags on the whole board; of a charuco board the squares. "any" numbers the dots of a
-        single image that may show a part of the plate. Not for coded targets.
+        Of inner corners, dots, separate squares or tags on the whole board; of a charuco board the squares. Of a plate of dots that is
+        larger than the images, with three marks or more among its dots, "any" will do. Not for coded targets.
     pitch : float or (float, float), optional
         Distance of neighbours along columns and rows, in the unit that object coordinates are wanted in. Not for coded targets.
     side : float, optional
@@ -143,6 +149,8 @@ def observations_of(
     dictionary : str, optional
         Of the markers: ``5X5_1000`` of a charuco board and ``APRILTAG_36h11`` of tags by default. Of coded targets ``RING_8``, ``RING_12``
         (the default), ``RING_14``, ``RING_16`` or ``RING_20``, by the segments of their rings.
+    plate : Looks, optional
+        Of a plate of dots: its marks as another camera's pictures were numbered by them (``ImageObservations.plate``).
     least_images : int
         From how many usable images on there is a result.
     threads : int, optional
@@ -171,7 +179,8 @@ def observations_of(
     if dictionary is not None and kind not in DICTIONARIES:
         raise InputError("a dictionary is one of markers", where="dictionary", value=dictionary, allowed="with charuco, aprilgrid or coded")
     markers = dictionary or DICTIONARIES.get(kind, "")
-    wanted = Wanted(kind, size, sides, polarity, channel, noise_model(noise), threads, layout, markers)
+    ratio = step[1] / step[0] if kind == "dots" else 1.0
+    wanted = Wanted(kind, size, sides, polarity, channel, noise_model(noise), threads, layout, markers, ratio)
     items = _items(images, layout)
     told = progress or no_progress
     seen: list[Seen] = []
@@ -179,9 +188,10 @@ def observations_of(
         seen.append(one)
         told("locating", len(seen), len(items))
     seen = _of_one_size(seen)
+    seen, marks, parts = numbered_parts(seen, wanted, plate) if kind == "dots" else (seen, None, ())
     good = [s for s in seen if not s.reason]
     _check_enough(seen, good, wanted, least_images)
-    good, numbering = _numbered(good, kind)
+    good, marks, numbering = (good, marks, parts) if parts else _numbered(good, kind, plate)
     out = _gathered(good, kind)
     names, xyz = _nominal(out.xyz, kind, step, side)
     return replace(
@@ -192,6 +202,7 @@ def observations_of(
         normal=np.tile([0.0, 0.0, 1.0], (len(names), 1)) if kind in ("dots", "asymmetric") else None,
         left_out=tuple((s.name, s.reason) for s in seen if s.reason),
         findings=(*_lost_images(seen), *numbering, *_notes(good), *out.findings),
+        plate=marks,
     )
 
 
@@ -265,19 +276,32 @@ def _check_enough(seen: list[Seen], good: list[Seen], wanted: Wanted, least: int
         what = f"the test field was identified in {len(good)} of {len(seen)} images only; in the others: {said}"
         remedy = "check kind, grid and polarity: part of the field may pass for all of it; else leave out images that do not show it"
         raise MeasureError(what, where="images", allowed="a third of them or more", remedy=remedy)
-    if wanted.kind == "dots" and wanted.grid is None and len(good) > 1:
-        what = "parts of a plate cannot be numbered consistently over several images"
-        raise InputError(what, where="grid", value="any", allowed="COLSxROWS of the whole plate; any for a single image")
 
 
-def _numbered(good: list[Seen], kind: str) -> tuple[list[Seen], tuple[Finding, ...]]:
-    """The same corner of the board is the first one in all images."""
+def _numbered(good: list[Seen], kind: str, plate: Looks | None) -> tuple[list[Seen], Looks | None, tuple[Finding, ...]]:
+    """The same corner of the board is the first one in all images; and the marks that tell it on a plate of dots."""
     if kind in NUMBERED:
-        return good, ()
+        return good, None, ()
     rows, cols = good[0].extent
     alike = {"chessboard": lambda: chessboard_turns(rows, cols), "asymmetric": lambda: asymmetric_turns(rows)}.get(kind, lambda: None)()
-    boards, findings = consistent([s.board for s in good], alike)
-    return [replace(s, keys=np.column_stack([b.row, b.col])) for s, b in zip(good, boards, strict=True)], findings
+    if kind != "dots":
+        boards, findings = consistent([s.board for s in good], alike)
+        return _renumbered(good, boards), None, findings
+    looks = [s.looks for s in good if s.looks is not None]
+    known = plate if plate is not None and plate.seen.shape == (rows, cols) else None
+    laid = by_marks(looks, (0, 1, 2, 3) if rows == cols else (0, 2), shifted=False, plate=known)
+    decided = [None if one is None else one.quarters for one in laid]
+    boards, findings = consistent([s.board for s in good], alike, decided, common=None if known is None else 0)
+    out = _renumbered(good, boards)
+    first = next((k for k, way in enumerate(laid) if way is not None), None)
+    if known is not None or first is None:
+        return out, known, findings
+    quarters = quarters_between(good[first].board, boards[first]) - laid[first].quarters  # type: ignore[union-attr]
+    return out, together(looks, laid)[0].turned(quarters), findings
+
+
+def _renumbered(good: Sequence[Seen], boards: Sequence[Board]) -> list[Seen]:
+    return [replace(s, keys=np.column_stack([b.row, b.col])) for s, b in zip(good, boards, strict=True)]
 
 
 def _gathered(good: list[Seen], kind: str) -> ImageObservations:

@@ -56,6 +56,12 @@ def turned(board: Board, quarters: int) -> Board:
     return replace(board, row=row, col=col, marks=marks)
 
 
+def quarters_between(before: Board, after: Board) -> int:
+    """By how many quarters of a turn a board was numbered anew."""
+    ways = [turned(before, k) for k in range(4)]
+    return next(k for k, way in enumerate(ways) if np.array_equal(way.row, after.row) and np.array_equal(way.col, after.col))
+
+
 def column_angle_deg(board: Board) -> float:
     """Direction in the image, from x towards y, in which the columns of a board are counted."""
     design = np.column_stack([board.col, board.row, np.ones(len(board.row))])
@@ -79,7 +85,12 @@ def dot_marks(board: Board, area_px: np.ndarray) -> Marks:
     return Marks(board.row, board.col, value, board.rows, board.cols)
 
 
-def consistent(boards: Sequence[Board], alike: tuple[int, ...] | None = None) -> tuple[list[Board], tuple[Finding, ...]]:
+def consistent(
+    boards: Sequence[Board],
+    alike: tuple[int, ...] | None = None,
+    decided: Sequence[int | None] | None = None,
+    common: int | None = None,
+) -> tuple[list[Board], tuple[Finding, ...]]:
     """Number a board in all of its images from the same corner.
 
     Parameters
@@ -89,6 +100,10 @@ def consistent(boards: Sequence[Board], alike: tuple[int, ...] | None = None) ->
     alike : tuple of int, optional
         Quarters of a turn after which the board looks the same, where each image alone rules out the others; by default those that map
         its rows and columns onto themselves, and marks decide: those of the images before, if most images show equally many.
+    decided : sequence of int, optional
+        Quarters by which each board is turned against one that all have in common; None where that is not known.
+    common : int, optional
+        Quarters by which that one is turned; by default so that the first of these boards stands upright.
 
     Returns
     -------
@@ -106,12 +121,17 @@ def consistent(boards: Sequence[Board], alike: tuple[int, ...] | None = None) ->
     boards = _with_trusted_marks(boards)
     out: list[Board] = []
     open_turns, widest, previous = 1, 0.0, 0.0
-    for board in boards:
+    for board, way in zip(boards, [None] * len(boards) if decided is None else decided, strict=True):
         turns = alike or ((0, 1, 2, 3) if board.rows == board.cols else (0, 2))
-        choices = [turned(board, k) for k in _agreeing(board, turns, known)]
+        if way is not None and common is not None:
+            turns = ((way + common) % 4,)
+        kept = _agreeing(board, turns, known)
+        choices = [turned(board, k) for k in kept]
         off = [abs(_wrapped(column_angle_deg(b) - previous)) for b in choices]
         best = choices[int(np.argmin(off))]
-        if out and len(choices) > 1:
+        if way is not None and common is None:
+            common = kept[int(np.argmin(off))] - way
+        elif out and len(choices) > 1:
             open_turns = max(open_turns, len(choices))
             widest = max(widest, min(off) * len(choices))
         previous = column_angle_deg(best)

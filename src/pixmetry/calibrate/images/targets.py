@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pixmetry.calibrate.images.looks import Looks, looks_of, round_steps
 from pixmetry.calibrate.images.numbering import Board, Marks, dot_marks
 from pixmetry.core.arrays import Flags
 from pixmetry.core.errors import InputError
@@ -29,6 +30,7 @@ MARKER_GAP, MARKER_CLEARANCE_PX = 0.7, 2.0  # from a corner to the next marker, 
 LEAST_NUMBERED = 8  # corners in an image
 MOST_MOVED, MOVED_PX = 0.2, (2.0, 6.0)  # of a corner from where it was seen: of the distance to the next one, within these limits
 LEAST_CODES = 4  # targets in an image
+LEAST_PART = 16  # dots of a plate that is larger than the image
 UNUSABLE = Flag.NOT_CONVERGED | Flag.BORDER
 
 
@@ -49,6 +51,8 @@ class Wanted:
         Of files without a header.
     dictionary : str
         Of markers, or of the codes of coded targets.
+    pitch_ratio : float
+        Distance of the rows of a plate over that of its columns.
     """
 
     kind: str
@@ -60,6 +64,7 @@ class Wanted:
     threads: int | None = None
     raw: RawLayout | None = None
     dictionary: str = ""
+    pitch_ratio: float = 1.0
 
     @property
     def whole(self) -> int:
@@ -87,8 +92,10 @@ class Seen:
     extent : (int, int)
         Rows and columns of the keys.
     marks : Marks, optional
+    looks : Looks, optional
+        Of the cells of a plate of dots.
     reason : str
-        Why the image cannot be used; empty if it can.
+        Why the image cannot be used by itself; empty if it can. With keys, it shows part of a plate, counted from the first that is seen.
     note : str
         What else is to be said about it.
     lossy : bool
@@ -103,6 +110,7 @@ class Seen:
     covariance_px2: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))
     extent: tuple[int, int] = (0, 0)
     marks: Marks | None = None
+    looks: Looks | None = None
     reason: str = ""
     note: str = ""
     lossy: bool = False
@@ -149,9 +157,7 @@ def _seen(name: str, frame: np.ndarray, found: Located | Positions, keys: np.nda
 def _located(name: str, frame: np.ndarray, kind: str, wanted: Wanted, grid: str | tuple[int, int] | None = None) -> Located:
     polarity = "auto" if kind == "chessboard" else wanted.polarity
     words = wanted.dictionary if kind == "coded" else RINGS_OF_12
-    return locate(
-        frame, kind=kind, grid=grid, polarity=polarity, noise=wanted.noise, dictionary=words, threads=wanted.threads, name=name
-    )
+    return locate(frame, kind=kind, grid=grid, polarity=polarity, noise=wanted.noise, dictionary=words, threads=wanted.threads, name=name)
 
 
 def _chessboard(name: str, frame: np.ndarray, wanted: Wanted) -> Seen:
@@ -169,17 +175,57 @@ def _dots(name: str, frame: np.ndarray, wanted: Wanted) -> Seen:
     keys = np.column_stack([found["grid_row"], found["grid_col"]])
     placed = keys[:, 0] >= 0
     rows, cols = (keys[placed].max(axis=0) + 1).tolist() if placed.any() else (0, 0)
-    if placed.sum() < 4 or wanted.grid not in (None, (cols, rows)):
+    if placed.sum() < 4:
         return _nothing(name, frame, f"{len(found)} dots were seen: {found.images[0]['grid']}")
+    if wanted.grid not in (None, (cols, rows)):
+        return _part(name, frame, found, wanted, f"{len(found)} dots were seen: {found.images[0]['grid']}")
     use = placed & _usable(found)
     if use.sum() < LEAST_WHOLE * wanted.whole:
-        return _nothing(
-            name, frame, f"{len(found)} dots were seen: too much of {cols} × {rows} is missing to be sure of its rows and columns"
-        )
-    seen = _seen(name, frame, found, keys, use, (rows, cols))
-    tilted = "semi_major_px" in found.columns
-    area = (found["semi_major_px"] * found["semi_minor_px"] if tilted else found["radius_px"] ** 2)[use]
-    return replace(seen, marks=dot_marks(seen.board, area))
+        missing = f"{len(found)} dots were seen: too much of {cols} × {rows} is missing to be sure of its rows and columns"
+        return _part(name, frame, found, wanted, missing)
+    if wanted.grid is None:
+        keys = _round_cells(found, keys, use, wanted)
+        rows, cols = (keys[use].max(axis=0) + 1).tolist()
+    seen = _with_looks(_seen(name, frame, found, keys, use, (rows, cols)), frame)
+    return replace(seen, marks=dot_marks(seen.board, _area_px(found)[use]))
+
+
+def _area_px(found: Located) -> np.ndarray:
+    area: np.ndarray = found["semi_major_px"] * found["semi_minor_px"] if "semi_major_px" in found.columns else found["radius_px"] ** 2
+    return area
+
+
+def _with_looks(seen: Seen, frame: np.ndarray) -> Seen:
+    return replace(seen, looks=looks_of(frame, seen.keys[:, 0], seen.keys[:, 1], seen.x_px, seen.y_px, seen.extent))
+
+
+def _part(name: str, frame: np.ndarray, found: Located, wanted: Wanted, reason: str) -> Seen:
+    """Part of a plate, counted from the first row and column that are seen, or nothing; and why it is not the whole."""
+    from pixmetry.locate.detect.grids import order_grid
+
+    grid = order_grid(found.x_px, found.y_px)
+    use = grid.placed & _usable(found)
+    if grid.message or use.sum() < LEAST_PART:
+        return _nothing(name, frame, reason)
+    keys = _round_cells(found, np.column_stack([grid.row, grid.col]), use, wanted)
+    rows, cols = (keys[use].max(axis=0) + 1).tolist()
+    return replace(_with_looks(_seen(name, frame, found, keys, use, (rows, cols)), frame), reason=reason)
+
+
+def _round_cells(found: Located, keys: np.ndarray, use: np.ndarray, wanted: Wanted) -> np.ndarray:
+    """Rows and columns along steps in which the dots are round, from 0."""
+    if "semi_major_px" in found.columns:
+        along, across, angle = found["semi_major_px"][use], found["semi_minor_px"][use], np.radians(found["angle_deg"][use])
+        axes = np.stack([np.stack([np.cos(angle), np.sin(angle)], 1), np.stack([-np.sin(angle), np.cos(angle)], 1)], axis=2)
+        shapes = np.einsum("nik,nk,njk->nij", axes, np.stack([along, across], axis=1) ** 2, axes)
+    else:
+        shapes = found["radius_px"][use][:, None, None] ** 2 * np.eye(2)
+    places = np.column_stack([found.x_px, found.y_px])[use]
+    change = round_steps(keys[use], places, shapes, wanted.pitch_ratio)
+    cells = np.full_like(keys, -1)
+    counted = keys[use] @ change.T
+    cells[use] = counted - counted.min(axis=0)
+    return cells
 
 
 def _asymmetric(name: str, frame: np.ndarray, wanted: Wanted) -> Seen:

@@ -12,6 +12,7 @@ import numpy as np
 from pixmetry.calibrate.bundle.model import CameraModel, Sensor
 from pixmetry.calibrate.bundle.network import Network
 from pixmetry.calibrate.checks.check_points import CheckPoints
+from pixmetry.calibrate.images.looks import Looks
 from pixmetry.calibrate.project.cameras import Described, described
 from pixmetry.calibrate.project.coordinates import ImageCoordinates, Measured, image_facts, measured, upwards
 from pixmetry.calibrate.project.points import Known, known_points, scale_bars, with_check_points
@@ -282,7 +283,8 @@ def _locate_targets(
     images: Table | None,
     progress: Progress | None,
     check: Callable[[tuple[int, int]], None],
-) -> tuple[CameraModel, Measured, Known, tuple[Finding, ...]]:
+    plate: Looks | None = None,
+) -> tuple[CameraModel, Measured, Known, tuple[Finding, ...], Looks | None]:
     """Locate the targets of a test field in pictures.
 
     Parameters
@@ -296,11 +298,13 @@ def _locate_targets(
     progress : callable, optional
     check : callable
         Called with (cols, rows) of the pictures; refuses what is not the size that was expected.
+    plate : Looks, optional
+        Marks of the test field as another camera's pictures were numbered by them.
 
     Returns
     -------
     tuple
-        The camera, what was measured, what the test field's description says of its points, and what was found on the way.
+        The camera, what was measured, what the test field's description says of its points, what was found on the way, and the marks.
 
     Raises
     ------
@@ -311,7 +315,7 @@ def _locate_targets(
 
     least = LEAST_IMAGES if camera.free.any() else 1  # one image suffices for a pose
     told = wanted.model_dump(exclude={"files", "kind"})
-    found = observations_of(files, wanted.kind, **told, least_images=least, progress=progress)
+    found = observations_of(files, wanted.kind, **told, least_images=least, plate=plate, progress=progress)
     check(found.sizes[0])
     camera_of, time_s, poses = image_facts(images, found.images, [camera], lambda name: name)
     network = found.network(_of_size(camera, *found.sizes[0]))
@@ -323,7 +327,7 @@ def _locate_targets(
         poses=poses,
         **{name: getattr(network, name) for name in ("image", "point", "x_px", "y_px", "covariance_px2", "covariance_known")},
     )
-    return network.cameras[0], seen, Known(network.xyz, network.u_xyz, network.diameter, network.normal), found.findings
+    return network.cameras[0], seen, Known(network.xyz, network.u_xyz, network.diameter, network.normal), found.findings, found.plate
 
 
 def _located(
@@ -332,16 +336,17 @@ def _located(
     """Locate the targets in the pictures of all cameras."""
     if not isinstance(wanted.files, dict):
         files = reader.pictures(wanted.files, wanted.raw)
-        camera, seen, plate, findings = _locate_targets(wanted, files, told[0].model, images, progress, told[0].check)
+        camera, seen, plate, findings, _ = _locate_targets(wanted, files, told[0].model, images, progress, told[0].check)
         return (camera,), seen, plate, findings
-    parts = []
+    parts, marks = [], None
     for one in told:
         files = reader.pictures(wanted.files[one.model.name], wanted.raw)
         try:
-            part = _locate_targets(wanted, files, one.model, None, progress, one.check)
+            part = _locate_targets(wanted, files, one.model, None, progress, one.check, marks)
         except MeasureError as error:
             error.where = f"{error.where} of {one.model.name}"
             raise
+        marks = part[4] if marks is None else marks
         parts.append((*part[:3], tuple(replace(said, text=f"{one.model.name}: {said.text}") for said in part[3])))
     names = [name for _, seen, _, _ in parts for name in seen.images]
     own = [f"{camera.name}/" if len(set(names)) < len(names) else "" for camera, _, _, _ in parts]
