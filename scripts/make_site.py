@@ -32,7 +32,7 @@ LINK = re.compile(r"(!?)\[([^\]]*)\]\(([^)\s]+)\)")
 HIDDEN = re.compile(r"^```.*?^```", re.M | re.S)
 SECTIONS = {  # of the site, and the pages of each; a page that stands in none stops the build
     "Getting started": ["start-folder-of-tiffs", "start-test-field", "start-data-sheet", "start-simulation"],
-    "Measure a camera": ["frames", "planning", "emva1288", "compare", "series", "closed-loop"],
+    "Measure a camera": ["frames", "planning", "capture", "emva1288", "compare", "series", "closed-loop"],
     "Measure with a camera": ["locating", "calibrating", "correct", "bound"],
     "Budget and simulate": ["budget", "bench", "data-sheets", "cameras", "scenes", "simulate"],
     "Handbook": ["handbook/index"],

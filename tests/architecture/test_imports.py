@@ -25,7 +25,7 @@ FLOORS = (
     ("locate",),
     ("simulate", "emva", "calibrate", "series"),
     ("budget",),
-    ("assess",),
+    ("assess", "capture"),
     ("bench",),
     ("cli",),
     ("__main__",),

@@ -12,7 +12,7 @@ from pixmetry.core import compiling
 from pixmetry.core.jit import jit
 from pixmetry.locate.estimators import estimators
 
-WITHOUT_KERNELS = {"sources", "compare", "shoot-list", "series", "init", "board", "bench", "view", "warm-up"}  # of their own
+WITHOUT_KERNELS = {"sources", "compare", "shoot-list", "series", "init", "capture", "board", "bench", "view", "warm-up"}  # of their own
 
 
 @pytest.fixture

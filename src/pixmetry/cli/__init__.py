@@ -31,6 +31,7 @@ _OS_REMEDIES = {errno.ENOSPC: "make room, or choose another folder", errno.ENAME
 # Each command lives in the module of its name below this package (- is _ there), as a click command of that name.
 COMMANDS = {
     "init": "Draft the manifest of a folder of frames, and ask what the files do not tell.",
+    "capture": "Take the frames of a shooting list with a live camera, or from a folder that fills.",
     "assess": "Assess a camera from dark and bright frames: error sources, error budget, advice, report.",
     "emva1288": "Test a camera by EMVA 1288 and write its data sheet, with uncertainties.",
     "sources": "List the error sources, or explain one of them.",

@@ -12,6 +12,7 @@ EXTRAS = {  # module: package, extra of the installation that brings it, what ne
     "pyarrow.parquet": ("pyarrow", "parquet", "writing a table as Parquet"),
     "starlette": ("starlette", "bench", "the pages of `pixmetry bench` and `pixmetry view`"),
     "uvicorn": ("uvicorn", "bench", "the pages of `pixmetry bench` and `pixmetry view`"),
+    "pypylon.pylon": ("pypylon", "basler", "cameras of kind basler"),
     "av": ("av", "video", "the error source storage.video_codec"),
 }
 
