@@ -139,7 +139,7 @@ def draw_unit(kind: str, number: int, seed: int) -> Unit:
     if analogue:
         values["electronics.video_amplifier"] = {"natural_mhz": flat(5, 8), "damping": flat(0.4, 0.8)}
         values["cable.termination"] = {"length_m": flat(3, 30), "line_ohm": 50.0}
-        values["grabber.low_pass"] = {"order": 3, "cutoff_mhz": flat(3.5, 4.8)}
+        values["grabber.low_pass"] = {"kind": "butterworth", "order": 3, "cutoff_mhz": flat(3.5, 4.8)}
         values["grabber.line_jitter"] = {"white_ns": flat(2, 15)}
         values["grabber.clamp"] = {"noise_dn": flat(0.1, 0.4)}
         if number % 2:
@@ -319,6 +319,9 @@ def truth_of(unit: Unit, source: str, parameter: str, settings: Mapping[str, str
     if (source, parameter) == ("electronics.row_noise", "column_e") and "electronics.column_noise" in unit.values:
         offset, gain = unit.values["electronics.column_noise"]["offset_dn"], unit.values["electronics.gain"]["gain_dn_per_e"]
         return float(offset / gain)  # type: ignore[operator]
+    if (source, parameter) == ("electronics.row_noise", "row_e") and "grabber.clamp" in unit.values:
+        own, clamp = unit.values[source][parameter], unit.values["grabber.clamp"]["noise_dn"]  # which one gain does not tell apart
+        return float(np.hypot(own, clamp / unit.values["electronics.gain"]["gain_dn_per_e"]))  # type: ignore[operator]
     if source == "optics.shading" and unit.covered:
         return _shading_of(unit, parameter)
     record = get_source(source)

@@ -82,13 +82,17 @@ def _filtered(kind: Any, order: int) -> Line:
         ),
     ],
 )
-def test_taps_are_what_the_line_of_the_sources_makes_of_one_pixel(model: LineModel, values: dict[str, float], line):
+def test_taps_and_gain_of_a_delay_are_what_the_line_of_the_sources_makes(model: LineModel, values: dict[str, float], line):
     """Against the state space by which cameras are simulated (float32); equal poles, moved apart by 1e-4, err by 3e-5."""
     zero, one = np.zeros(1, np.int64), np.zeros((1, 1, TAPS), np.float32)
     one[0, 0, 0] = 1
     expected = line().limited().read(one, zero, Grid(zero, zero, zero, (1, TAPS)))[0, 0]
     np.testing.assert_allclose(model.taps(values), expected, atol=4e-5)
     assert model.delay_px(values) == pytest.approx(line().delay_s * MHZ * 1e6, abs=2e-6)
+    # rows that come ± 0.02 px late move the sum over a step by so much times the gain
+    step, late, whole = (np.arange(4 * TAPS) > 4).astype(np.float32)[None, None], 0.02, Grid(zero, zero, zero, (1, 3 * TAPS))
+    moved = [line().limited().delayed(np.full((1, 1), d / (MHZ * 1e6))).read(step, zero, whole).sum(dtype=float) for d in (-late, late)]
+    assert model.row_gain(values) == pytest.approx((moved[0] - moved[1]) / (2 * late), abs=3e-3)
 
 
 def test_filter_and_cable_are_found_behind_noise_and_jitter(rng: np.random.Generator):

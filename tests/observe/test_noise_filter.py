@@ -12,10 +12,18 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from pixmetry.camera.noise_covariance import LAGS, NoiseFilter, charge_response, sampling_covariance
+from pixmetry.camera.noise_covariance import (
+    LAGS,
+    NoiseCovariance,
+    NoiseFilter,
+    blur_kernel,
+    charge_response,
+    response_to_white,
+    sampling_covariance,
+)
 from pixmetry.core.number import Estimates
 from pixmetry.observe.noise_covariance import LagProducts, lag_products
-from pixmetry.observe.noise_filter import before_correlation
+from pixmetry.observe.noise_filter import before_correlation, find_noise_filter
 from pixmetry.observe.observe import Group, observe
 
 SHAPE, GAIN, NOISE_E, OFFSET, TOP = (120, 160), 0.5, 8.0, 60.0, 4095
@@ -155,6 +163,30 @@ def test_pixels_that_are_full_below_the_last_code_tell_no_filter(rng):
     gain = seen.photon_transfer_fit["gain_dn_per_e"]
     assert seen.noise_filter.kind == "white" and abs(gain.value - GAIN) < Z * gain.u
     assert gain.u < 0.02 * GAIN
+    assert seen.series.bright.mean_dn[-3] < seen.series.full_dn <= seen.series.bright.mean_dn[-1]
+
+
+def exact(law: Callable[[np.ndarray], np.ndarray]) -> NoiseCovariance:
+    """Covariances without any scatter: 20 black levels, and 10 of light whose shot noise, up to 2000 DN², is correlated by a law."""
+    shot = np.concatenate([np.zeros(20), np.linspace(200.0, 2000.0, 10)])
+    products = np.zeros((30, 2, 2, 5, 9))
+    products[..., 0, 4] = (50.0 + shot)[:, None, None]
+    for k, values in enumerate(law(shot[20:]).T):
+        j, i = LAGS[1:][k]
+        products[20:, :, :, j, 4 + i] = values[:, None, None]
+    bright, none, mean = shot > 0, np.full((30, 2), np.nan), 100 + 2 * shot
+    return NoiseCovariance(
+        bright, ~bright, np.ones(30), mean, mean, np.zeros(30), np.ones(30, int), products, 50.0 + shot, none, np.zeros(30), (500, 500), 4
+    )
+
+
+def test_a_correlation_of_a_thousandth_is_charge_and_no_filter_where_both_fit():
+    """A blur that changes the variance by 1 % stands back; one by 39 %, which repelled charge does not fit, does not."""
+    for sigma, kind in ((0.27, "charge"), (0.4, "linear")):
+        correlation, _ = response_to_white(blur_kernel(sigma, 1))
+        found = find_noise_filter(exact(lambda shot, c=correlation: np.outer(shot, c[1:])))
+        assert found is not None and found.kind == kind
+    assert found.rival is None
 
 
 def test_jitter_at_the_left_border_is_no_noise_of_the_light(rng):
@@ -185,11 +217,16 @@ def test_u_of_a_contrast_grows_with_it_when_a_filter_is_undone():
 
 
 def test_the_pattern_behind_an_unknown_filter_is_not_told():
-    """That of a demosaicking is: its original pixels are as the converter gave them. Rows keep theirs."""
-    rows = [(name, 0.01, 1e-4, np.inf, "1") for name in ("prnu_pixel_rel", "prnu_col_rel", "prnu_row_rel", "dsnu_pixel_dn")]
-    spatial = Estimates.from_rows(rows, method="as drawn")
-    found = before_correlation(spatial, NoiseFilter(kind="unknown", name="no linear filter fits", factor=1.3, u_factor=0.3), 100.0)
-    assert found.names == ("prnu_row_rel",)
-    assert all("no linear filter fits" in found.reasons[name] for name in ("prnu_pixel_rel", "prnu_col_rel", "dsnu_pixel_dn"))
+    """That of a demosaicking is: its original pixels are as the converter gave them. Along the rows alone, rows keep theirs."""
+    names = ("prnu_pixel_rel", "prnu_col_rel", "prnu_row_rel", "dsnu_pixel_dn", "dsnu_row_dn")
+    spatial = Estimates.from_rows([(name, 0.01, 1e-4, np.inf, "1") for name in names], method="as drawn")
+    along = np.array([1.0 if j == i == 0 else 0.2 if j == 0 and abs(i) == 1 else 0.0 for j, i in LAGS])
+    both = np.array([1.0 if j == i == 0 else 0.2 if abs(j) + abs(i) == 1 else 0.0 for j, i in LAGS])
+    for correlation, kept in ((along, ("prnu_row_rel", "dsnu_row_dn")), (both, ())):
+        covariance = 1e-6 * np.eye(len(LAGS) - 1)
+        unknown = NoiseFilter("unknown", "no linear filter fits", factor=1.3, u_factor=0.3, correlation=correlation, covariance=covariance)
+        found = before_correlation(spatial, unknown, 100.0)
+        assert found.names == kept
+        assert all("no linear filter fits" in found.reasons[name] for name in set(names) - set(kept))
     kept = before_correlation(spatial, NoiseFilter(kind="unknown", name="demosaicking, bilinear, stored colour green"), 100.0)
     assert kept.names == spatial.names

@@ -328,6 +328,8 @@ def observe_campaign(campaign: Campaign, progress: Progress) -> tuple[InputHashe
     gain = fit["gain_dn_per_e"].value if fit is not None and "gain_dn_per_e" in fit else None
     known = fit is not None and {"saturation_dn", "offset_dn"} <= set(fit.names)
     full = fit["saturation_dn"].value - fit["offset_dn"].value if fit is not None and known else float("inf")
+    if fit is not None and "offset_dn" in fit:
+        full = min(full, seen.series.full_dn - fit["offset_dn"].value)
     bordered = covered_pixels(borders, campaign.camera.interface == "analogue", gain, full)
     coded = [f"frames of kind {kind} are JPEG: their positions hold what the coder does" for kind in sorted(reader.located_with_loss)]
     notes = (*campaign.findings, *left_out, *seen.notes, *coded, *(() if bordered is None else bordered.notes))

@@ -78,6 +78,17 @@ class PhotonTransfer:
     bright_rows: LevelRows | None = None
     dark_rows: LevelRows | None = None
 
+    @property
+    def full_dn(self) -> float:
+        """Mean of the darkest bright level at which many pixels are full below the last code; infinite without one.
+
+        Full pixels have no shot noise: the temporal variance falls from one level to a brighter one, by a quarter or more.
+        """
+        order = np.argsort(self.bright.mean_dn, kind="stable")
+        var = self.bright.ms_pixel_dn2[order]
+        fallen = (var < FALLEN * np.maximum.accumulate(var)) & (np.maximum.accumulate(var) > LEAST_KNEE_DN2)
+        return float(self.bright.mean_dn[order][fallen][0]) if fallen.any() else float("inf")
+
 
 @dataclass(frozen=True)
 class StackMoments:
@@ -794,6 +805,8 @@ class Storage:
 
 
 UNKNOWN_BEND_REL = 0.005  # of a response that is not measured; linear cameras stay below it (EMVA 1288, linearity error)
+FALLEN = 0.75  # of the temporal variance, over that of a darker level, where pixels are full
+LEAST_KNEE_DN2 = 2.0  # of it, above which rounding does not make it fall
 
 
 @dataclass(frozen=True)

@@ -13,11 +13,14 @@ from pixmetry.core.number import ONE_SIDED_95, Estimates
 NOT_SIGNIFICANT = 3.0
 # What a delay moves a row by, over the delay: 1 behind a low-pass that leaves nothing at the pixel clock, else 1 ± 2 |H(pixel clock)| by
 # the phase of the sampling. 0.91 to 1.09 behind a Butterworth filter of third order at 5 MHz (pixel clock 14.2 MHz), 1.26 behind an
-# amplifier of 8 MHz alone.
-GAIN_REL = 0.03
+# amplifier of 8 MHz alone. Slanted edges tell it with the rest of the line.
+GAIN_REL = 0.03  # behind a filter that was made for the pixel clock
+UNKNOWN_GAIN_REL = 0.1  # of a line that nobody told
 
 
-def delays_ns(found: Estimates, names: Mapping[str, str], clock_mhz: float | None, *, where: str) -> Estimates:
+def delays_ns(
+    found: Estimates, names: Mapping[str, str], clock_mhz: float | None, *, where: str, gain: tuple[float, float] = (1.0, GAIN_REL)
+) -> Estimates:
     """Shifts of rows as delays.
 
     Parameters
@@ -30,11 +33,13 @@ def delays_ns(found: Estimates, names: Mapping[str, str], clock_mhz: float | Non
         Of the samples that are stored.
     where : str
         Id of the source.
+    gain : (float, float)
+        By how much a row moves over its delay, and its u: a line that is not free of the pixel clock moves by more or less.
 
     Returns
     -------
     Estimates
-        With 3 % of each delay in common: a line that is not free of the pixel clock moves by more or less than its delay.
+        With the u of the gain in common to all delays.
 
     Raises
     ------
@@ -46,7 +51,7 @@ def delays_ns(found: Estimates, names: Mapping[str, str], clock_mhz: float | Non
         raise MeasureError("shifts of rows were measured in px; a delay needs the clock", where=where, remedy=remedy)
     old = [f"{name}_px" if f"{name}_px" in found else name for name in names]
     new = dict(zip(old, names.values(), strict=True))
-    scale = np.array([1e3 / clock_mhz if unit == "px" else 1.0 for unit in found.units])
+    scale = np.array([1e3 / clock_mhz / gain[0] if unit == "px" else 1.0 for unit in found.units])
     covariance = found.covariance * np.outer(scale, scale)
     delays = np.array(
         [
@@ -59,7 +64,7 @@ def delays_ns(found: Estimates, names: Mapping[str, str], clock_mhz: float | Non
         found,
         names=renamed,
         values=found.values * scale,
-        covariance=covariance + GAIN_REL**2 * np.outer(delays, delays),
+        covariance=covariance + (gain[1] / gain[0]) ** 2 * np.outer(delays, delays),
         units=tuple("ns" if unit == "px" else unit for unit in found.units),
         limits=frozenset(new.get(name, name) for name in found.limits),
         reasons={new.get(name, name): why for name, why in found.reasons.items()},

@@ -129,6 +129,20 @@ class LineModel:
         delays, amplitudes = self.paths(q)
         return float(-(1 / self.poles(q)).sum().real + delays @ amplitudes / amplitudes.sum())
 
+    def row_gain(self, q: dict[str, float]) -> float:
+        """By how much the samples of a row move over its delay: the slopes at the sampling times, summed over a step.
+
+        What passes the line at the pixel clock, H(1), folds back: 1 + 2 Σ Re(H(m) e^(iπm)) over m = 1, 2, … of samples in the middle of
+        the pixels (Poisson). A line without a filter goes straight from pixel to pixel, and has 1.
+        """
+        poles = _separated(self.poles(q))
+        if not len(poles):
+            return 1.0
+        delays, amplitudes = self.paths(q)
+        first = np.ceil(delays - 0.5) + 0.5 - delays  # from a path's start to the next sample k + ½
+        pulses = (-poles * residues_of(poles) * np.exp(np.outer(first, poles)) / (1 - np.exp(poles))).sum(axis=1).real
+        return float(amplitudes @ pulses / amplitudes.sum())
+
 
 def paths_of(delay: float, direct: float, first: float, ratio: float) -> tuple[Array, Array]:
     """A direct path, and echoes ``direct · first · ratio^k`` after k + 1 delays, or ``ratio^k`` after k where ``first`` is 1."""
@@ -619,7 +633,8 @@ def line_estimates(found: LineSearch) -> tuple[Estimates, Estimates]:
     Returns
     -------
     line : Estimates
-        ``delay_px``: how much later the centroid of anything comes. Of a part that every model needs which the edges allow, its
+        ``delay_px``: how much later the centroid of anything comes. ``row_gain``: by how much the samples of a row move over its delay
+        (`LineModel.row_gain`). Of a part that every model needs which the edges allow, its
         parameters: frequencies over the pixel clock (``cutoff_rel``, ``natural_rel``), ``damping``, ``ghost_rel`` (amplitude of an echo
         over the one before), ``echo_px`` and ``branch_px`` (delays). ``settings`` has kind and order of the filter. ``reasons`` say why
         others are missing. Empty where no line fits, and where jitter of the rows may be what smooths the edges.
@@ -682,7 +697,7 @@ NEEDED = "take the same edges with the filter of the grabber switched off"
 
 
 def _mean_of_models(found: LineSearch, names: Sequence[str]) -> tuple[Array, Array]:
-    """Mean and covariance of (free optics, σ, these parameters, delay) over the models."""
+    """Mean and covariance of (free optics, σ, these parameters, gain of a row's delay, delay) over the models."""
     each, covariances, weights = [], [], []
     spread = [(f, weight * share) for fit, weight in found.weights for f, share in found.spread_of(fit)]
     for fit, weight in spread:
@@ -698,13 +713,13 @@ def _mean_of_models(found: LineSearch, names: Sequence[str]) -> tuple[Array, Arr
     # a simpler line that χ² does not exclude may have another delay: pulses that are one pixel late look like none, of a bare line
     most = min(f.chi2 for f in found.fits) + FOUND_CHI2 * found.scale
     simpler = [f for f in found.fits if f.chi2 < most and len(f.model.names) < len(found.best.model.names)]
-    away = [f.model.delay_px(f.line) - mean[-1] for f in simpler]
-    out[-1, -1] += max(np.square(away), default=0.0) / 3
+    for at, of in ((-1, LineModel.delay_px), (-2, LineModel.row_gain)):
+        out[at, at] += max((np.square(of(f.model, f.line) - mean[at]) for f in simpler), default=0.0) / 3
     return np.asarray(mean, float), out
 
 
 def _values(fit: LineFit, names: Sequence[str]) -> tuple[Array, Array]:
-    """(free optics, σ, parameters, delay) of a fit, and their derivatives by what was free."""
+    """(free optics, σ, parameters, gain of a row's delay, delay) of a fit, and their derivatives by what was free."""
     k, own = len(fit.free), fit.model.names
 
     def at(x: Array) -> Array:
@@ -712,7 +727,7 @@ def _values(fit: LineFit, names: Sequence[str]) -> tuple[Array, Array]:
         p[list(fit.free)] = x[:k]
         q = dict(zip(own, x[k:], strict=True))
         sigma = np.sqrt(max(p[0] - _of_others(p), 1e-3))
-        return np.array([*x[:k], sigma, *(q[name] for name in names), fit.model.delay_px(q)])
+        return np.array([*x[:k], sigma, *(q[name] for name in names), fit.model.row_gain(q), fit.model.delay_px(q)])
 
     x = np.array([*fit.optics[list(fit.free)], *(fit.line[name] for name in own)])
     here = at(x)
@@ -724,7 +739,7 @@ def _values(fit: LineFit, names: Sequence[str]) -> tuple[Array, Array]:
 def _split(found: LineSearch, names: Sequence[str], values: Array, covariance: Array) -> tuple[Estimates, Estimates]:
     """Optics and line as estimates."""
     free = found.best.free
-    labels = (*(OPTICS[j] for j in free), "sigma_px", *names, "delay_px")
+    labels = (*(OPTICS[j] for j in free), "sigma_px", *names, "row_gain", "delay_px")
     dof = np.full(len(labels), float(found.best.dof))
     units = tuple("px²" if name == OPTICS[0] else "px" if name.endswith("_px") else "1" for name in labels)
     whole = Estimates(labels, values, covariance, dof, units, METHOD)
@@ -770,4 +785,4 @@ def _correlated(found: Estimates) -> tuple[str, ...]:
     correlation = np.divide(found.covariance, scale, out=np.zeros_like(scale), where=scale > 0)
     pairs = [(i, j) for i in range(len(found)) for j in range(i) if abs(correlation[i, j]) > 0.9]
     told = [f"{found.names[j]} and {found.names[i]} from slanted edges are correlated by {correlation[i, j]:+.2f}" for i, j in pairs]
-    return tuple(text for text in told if "delay_px" not in text and "spread_var" not in text)
+    return tuple(text for text in told if not any(name in text for name in ("delay_px", "row_gain", "spread_var")))

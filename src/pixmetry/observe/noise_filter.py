@@ -57,6 +57,7 @@ SHARPENING, BLUR, KERNEL, LINE, LOSS = (
 BLUR_RADII = (1, 2, 3)
 REACHES = (0.0, 0.4, 0.7, 1.0)  # px, of the repulsion that is looked for
 SMALL = 0.05  # relative change of the gain up to which a correlation of unknown origin is taken as linear, at a u of its own size
+WEAK = 0.03  # relative change of the gain up to which a filter stands back behind repelled charge that fits nearly as well
 RIVAL = 5.0  # by how much of χ²/2 another family may fit worse that is not excluded
 MOST_GROWTH = 0.2  # of the correlation, summed, from dark to bright: more than repelled charge does
 # correlation of normal noise behind medians of 3 × 3 and of 5 × 5 pixels, by the smaller and the larger lag: from 2e7 simulated pixels
@@ -71,6 +72,7 @@ OF_MEDIAN = 0.02  # rounding and the skewness of the shot noise change these
 ALONG_LINE_REL = 0.04  # of a fixed contrast: jitter of the rows in the mean of the frames, echoes later than the lags
 RESOLVED = 10.0  # u of the shot variance of a level that counts
 OF_PIXELS, OF_COLUMNS = ("prnu_pixel_rel", "dsnu_pixel_dn"), ("prnu_col_rel", "dsnu_col_dn")
+OF_ROWS = ("prnu_row_rel", "dsnu_row_dn")
 LEAST_DOUBT = 0.1  # of the gain's u: a smaller part adds less than 0.5 % to it
 
 
@@ -393,6 +395,8 @@ def _explained(plain: NoiseFilter, part: _ShotPart) -> NoiseFilter:
     if matches:
         best = min(matches, key=_price)
         rivals = [m for m in matches if _price(m) < _price(best) + RIVAL]
+        if abs(best.factor - 1) < WEAK:  # every sensor repels charge, and nobody makes a filter that changes so little
+            best = min((m for m in rivals if m.family.kind == CHARGE), key=_price, default=best)
         doubt = max(abs(m.factor - best.factor) for m in rivals if m.family.kind == best.family.kind)
         others = [m for m in rivals if m.family.kind != best.family.kind]
         other = _as_found(plain, min(others, key=_price), part, 0.0) if others else None
@@ -505,7 +509,10 @@ def before_correlation(spatial: Estimates, found: NoiseFilter, shot_dn2: float) 
     """
     if found.kind == UNKNOWN and not found.name.startswith(("demosaicking", MEDIAN)):
         why = f"what correlates neighbouring pixels ({found.name}) changes the pattern too, and by how much is not told"
-        lost = [n for n in (*OF_PIXELS, *OF_COLUMNS) if n in spatial]
+        across = np.array([j > 0 for j, _ in LAGS[1:]])  # a filter along the rows leaves the means of rows as they are
+        u = np.sqrt(np.diag(found.covariance))
+        rows = () if (np.abs(found.correlation[1:]) <= FOUND_Z * u)[across].all() and u.any() else OF_ROWS
+        lost = [n for n in (*OF_PIXELS, *OF_COLUMNS, *rows) if n in spatial]
         kept = spatial.select([n for n in spatial.names if n not in lost])
         return replace(kept, reasons={**kept.reasons, **dict.fromkeys(lost, why)})
     if found.kind not in (CHARGE, WHITE, LINEAR) or shot_dn2 <= 0:

@@ -17,6 +17,7 @@ from pixmetry.core.number import ONE_SIDED_95, Estimates
 from pixmetry.core.random import Grid, Stream
 
 LEAST_LEVELS, MOST_CLIPPED, NOT_SIGNIFICANT = 5, 0.002, 3.0
+MOST_FULL = 0.9  # of the level at which pixels are full below the last code
 METHOD = "temporal variance of the column means of flat fields, less that of white noise, against the square of the signal"
 CONFOUNDERS = ("gain of the columns: light that changes its distribution over the frame from frame to frame",)
 
@@ -84,6 +85,8 @@ def measure(observations: Observations) -> Estimates:
         raise MeasureError(what, where=where, remedy="switch off every filter in the camera, and take raw frames")
     dark, light = series.dark, series.bright
     open_ = light.fraction_max < MOST_CLIPPED if light.mean_dn.size else np.zeros(0, bool)
+    if dark.mean_dn.size and np.isfinite(series.full_dn):  # the noise of charge that spills along the columns is theirs, too
+        open_ &= light.mean_dn - dark.mean_dn.mean() < MOST_FULL * (series.full_dn - dark.mean_dn.mean())
     if dark.mean_dn.size == 0 or np.count_nonzero(open_) < LEAST_LEVELS:
         raise MeasureError("the growth of column noise with the light is not told", where=where, value=int(open_.sum()), remedy=remedy)
     rows, cols = series.frame_shape

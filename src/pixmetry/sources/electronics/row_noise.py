@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -13,6 +14,8 @@ from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, cut_rows, quantity
 from pixmetry.core.number import Estimates
 from pixmetry.core.random import Stream
+
+CLAMP = "grabber.clamp: what its level of black varies by from line to line counts here; a second gain in front of it tells them apart"
 
 
 class RowNoise(Parameters):
@@ -42,6 +45,8 @@ def measure(observations: Observations) -> Estimates:
         where="electronics.row_noise",
         remedy="take dark pairs",
     )
+    if observations.stated.interface == "analogue":
+        noise = replace(noise, confounders=(*noise.confounders, CLAMP))
     rows, fit = observations.dark_rows, observations.photon_transfer_fit
     if rows is None or fit is None or "gain_dn_per_e" not in fit:
         return noise

@@ -11,13 +11,17 @@ from pixmetry.camera.contribution import Contribution, Probe, smooth_part
 from pixmetry.camera.line import alike_rows
 from pixmetry.camera.line_contribution import from_row_delays, from_steady_delays
 from pixmetry.camera.observations import Observations
-from pixmetry.camera.row_delays import delays_ns
+from pixmetry.camera.row_delays import UNKNOWN_GAIN_REL, delays_ns
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, quantity
 from pixmetry.core.errors import MeasureError
 from pixmetry.core.number import Estimates
 from pixmetry.core.random import Grid, Stream
 
+UNTOLD_GAIN = (
+    "u holds a tenth of it: what the line keeps at the pixel clock makes a row move by more or less than its delay; slanted edges tell by "
+    "how much (kind: edge)"
+)
 BEAT = "not separable from the beat of the grabber's clock with the pixels: sample by the pixel clock"
 OWN_CLOCK = (
     "grabber.sampling_clock: delays and periods are in the time of the pixel clock; of a grabber that samples by a clock of its own they "
@@ -92,7 +96,13 @@ def measure(observations: Observations) -> Estimates:
     kept = ("loop_rows", "settling_rows", "interlaced")
     found = observations.row_jitter({f"{n}_px": f"{n}_px" for n in names} | {n: n for n in kept}, where="grabber.line_jitter")
     clock = observations.sample_clock_mhz
-    told = delays_ns(found, names, clock, where="grabber.line_jitter")
+    line = None if observations.edges is None else observations.edges.line
+    gain, why = (1.0, UNKNOWN_GAIN_REL), UNTOLD_GAIN
+    if line is not None and "row_gain" in line:
+        gain, why = (line["row_gain"].value, line["row_gain"].u), f"rows move by {line['row_gain'].value:.2f} of their delay, by the edges"
+    told = delays_ns(found, names, clock, where="grabber.line_jitter", gain=gain)
+    if "white_ns" in told:
+        told = replace(told, reasons={**told.reasons, "white_ns": "; ".join(filter(None, (told.reasons.get("white_ns", ""), why)))})
     if clock != observations.stated.pixel_clock_mhz:
         left = told.select([name for name in told.names if not name.startswith("settling")])
         return replace(left, reasons={**left.reasons, "settling_ns": BEAT})

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from pixmetry.camera.contribution import Contribution, Probe
+from pixmetry.camera.dark_rows import without_variance
 from pixmetry.camera.observations import Observations
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import Parameters, Source, cut_map, quantity
@@ -79,7 +80,8 @@ def _before_transfer(found: Estimates, observations: Observations) -> Estimates:
     """The contrasts before smear added light without them, and before late charge took them from pixel to pixel.
 
     A share n ε of a packet that comes a pixel later leaves 1 − n ε of a contrast of independent pixels, n being half of the transfers from
-    the farthest pixel. Smear s/t of the light adds 1 + s/t to the light of pixels and rows; that of columns is in it.
+    the farthest pixel. Smear s/t of the light adds 1 + s/t to the light of pixels and rows; that of columns is in it. The mean of the n
+    pixels of a column, too, keeps its contrast, which was taken off by the smaller one of the pixels behind the smear.
     """
     stack = observations.bright_stack
     if stack is None:
@@ -95,7 +97,13 @@ def _before_transfer(found: Estimates, observations: Observations) -> Estimates:
     factor = np.array([parts[name][0] for name in found.names])
     u = np.array([float(np.linalg.norm(parts[name][1])) for name in found.names])
     covariance = found.covariance * np.outer(factor, factor) + np.diag((found.values * u) ** 2)
-    return replace(found, values=found.values * factor, covariance=covariance)
+    found = replace(found, values=found.values * factor, covariance=covariance)
+    if not more or "pixel_std_rel" in found.limits:
+        return found
+    pixel, diluted = found["pixel_std_rel"], 1 - (1 + more) ** -2.0
+    square = pixel.value**2 / stack.shape[0] * diluted
+    u_square = square * float(np.hypot(2 * pixel.u / pixel.value, 2 * u_more / (1 + more) ** 3 / diluted))
+    return without_variance(found, "col_std_rel", square, u_square, "the pixels' own contrast, which smear leaves in the means of columns,")
 
 
 def correct(params: Prnu, signal: Signal, maps: Mapping[str, np.ndarray]) -> Signal:
