@@ -26,6 +26,7 @@ FAINTEST_BEAM = 0.1  # height of a beam over that of the frame's strongest
 TEMPLATES = ("template", "poisson_gaussian")  # estimators that can do without some pixels
 ROWS_ARE = ("asymmetric", "hexagonal")  # every other one shifted by half a step
 FAINTEST = 0.05  # height of lines and edges over that of the frame's strongest
+LEAST_WAVE_DN = 1.0  # height of the waves that a coder draws, from which one may pass for a slope
 
 
 class Wanted(NamedTuple):
@@ -145,6 +146,8 @@ def locate_spots(task: Task) -> Measured:
         shape = seen
         estimator, reason = chosen_estimator(targets, noise, why)
     planes = False if task.kind == "coded" else task.planes  # the rings would pass for slopes
+    if planes == "auto" and coder is not None and coder.pattern_dn > LEAST_WAVE_DN:
+        planes = "shared"  # a wave of the coder over one target would pass for a slope
     settings = Settings(shape, planes, task.light_on, task.aperture_px, task.threads)
     positions = methods()[estimator].positions(_without_defects(task, estimator), targets, noise, settings)
     positions = _with_defects_flagged(task, targets, positions)

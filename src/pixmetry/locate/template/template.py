@@ -32,6 +32,7 @@ MEDIAN_FALL = {2: (1.386, 2.0), 4: (3.357, 3.19)}  # median of χ² with 2 or 4 
 POOL = 20  # targets from which their falls are also looked at together
 POOLED_SIGMA = 5.0
 NEIGHBOURS = 8  # targets around one that must agree with it on a plane
+AUTO = ("auto", "shared")
 PIECES = 8  # of the work
 FAR_OUT = 25.0  # times the usual
 POOR_SIGMA = 5.5
@@ -111,8 +112,9 @@ def fit_template(
         With weights from the fitted mean, least squares solves the likelihood equations of a Poisson number shifted by the read noise's
         variance (Huang et al. 2013). ``poisson_gaussian`` uses the exact likelihood (Snyder et al. 1995) where the mean is below 60
         electrons and the read noise below 3; it is the same as least squares where the noise does not depend on the level.
-    background_plane, light_plane : {"auto"} or bool
-        A slope of the background, and of the light on the target, among the unknowns; see Notes.
+    background_plane, light_plane : {"auto", "shared"} or bool
+        A slope of the background, and of the light on the target, among the unknowns; see Notes. "shared": as "auto", but none that a
+        single target asks for, where what is in one place alone is no light: the waves of a coder.
         A spot knows no light plane: to first order it is a shift.
     light_on : {"surface", "image"}
         See `model`.
@@ -147,8 +149,10 @@ def fit_template(
     if likelihood not in LIKELIHOODS:
         raise InputError("no such likelihood", value=likelihood, allowed=", ".join(LIKELIHOODS))
     for name, value in (("background_plane", background_plane), ("light_plane", light_plane)):
-        if value not in ("auto", True, False):
-            raise InputError(f"{name} is neither on nor off", value=value, allowed='"auto", True, False')
+        if value not in (*AUTO, True, False):
+            raise InputError(f"{name} is neither on nor off", value=value, allowed='"auto", "shared", True, False')
+    single = "shared" not in (background_plane, light_plane)
+    background_plane, light_plane = ("auto" if value in AUTO else value for value in (background_plane, light_plane))
     if kind == "spot":
         if light_plane is True:
             raise InputError("light that falls off over a Gaussian spot cannot be distinguished from a shift", allowed="light_plane=False")
@@ -171,6 +175,7 @@ def fit_template(
             free = ground and background_plane == "auto", light and light_plane == "auto"  # the other one is wanted in any case
             if any(free):
                 there, other = predicted(windows, targets, result, again, (ground, light), threads)
+                there = there if single or there.all() and len(again) >= POOL else np.zeros_like(there)
                 on_ground[again[~there]], on_light[again[~there]] = other[0] or ground and not free[0], other[1] or light and not free[1]
                 again = again[there]
             if not len(again):
