@@ -37,7 +37,7 @@ def test_tables_maps_and_positions_of_a_folder(tmp_path: Path) -> None:
     tables = {t.name: t for t in found.tables}
     assert found.kind == "pixmetry/results/1"
     assert tables["camera"].rows == (("name", "seven"), ("bits", 12))
-    assert tables["estimates.sensor.prnu"].rows == (("pixel_std_rel", 0.01, 0.001),)
+    assert tables["estimates.sensor.prnu"].rows == (("pixel_std_rel", 0.01, 0.001),) and found.tables[0].name == "budget.rows"
     assert tables["budget.rows"].columns == ("name", "source_id", "total_px", "parts.time_px")
     assert tables["points"].rows == (("a", 1.0), ("b", 2.0))
     assert tables["residuals.csv"].rows == (("first", 10.5, 20.25, 0.01, -0.02), ("second", 30.0, None, 0.5, None))
@@ -50,9 +50,34 @@ def test_tables_maps_and_positions_of_a_folder(tmp_path: Path) -> None:
 def test_a_picture_is_the_first_map_and_a_large_one_is_thinned(tmp_path: Path) -> None:
     (tmp_path / "found.csv").write_text(POSITIONS)
     write_frame(tmp_path / "a.png", np.full((40, 2 * MOST_SIDE), 7, np.uint8), 8)
-    found = read_result(tmp_path / "found.csv", tmp_path / "a.png")
-    assert found.maps[0].name == "a.png" and found.maps[0].step == 2 and found.maps[0].values.shape == (20, MOST_SIDE)
+    found = read_result(tmp_path / "found.csv", [tmp_path / "a.png"])
+    record = found.maps[0].to_record()
+    assert found.maps[0].name == "a.png" and record["step"] == 2 and (record["rows"], record["cols"]) == (20, MOST_SIDE)
     json.dumps(found.to_record(), allow_nan=False)
+
+
+def test_pictures_are_found_beside_the_result_and_in_a_folder(tmp_path: Path) -> None:
+    (tmp_path / "pictures").mkdir()
+    (tmp_path / "found.csv").write_text(POSITIONS.replace("first", "a.png").replace("second", "b.png"))
+    write_frame(tmp_path / "a.png", np.zeros((4, 5), np.uint8), 8)
+    write_frame(tmp_path / "pictures" / "b.png", np.zeros((4, 5), np.uint8), 8)
+    write_frame(tmp_path / "pictures" / "other.png", np.zeros((4, 5), np.uint8), 8)
+    assert [m.name for m in read_result(tmp_path / "found.csv").maps] == ["a.png"]
+    assert [m.name for m in read_result(tmp_path / "found.csv", [tmp_path / "pictures"]).maps] == ["a.png", "b.png"]
+    with pytest.raises(InputError, match="no such picture"):
+        read_result(tmp_path / "found.csv", [tmp_path / "none.png"])
+
+
+def test_records_by_name_are_one_table_and_matrices_are_maps(tmp_path: Path) -> None:
+    values = {name: {"value": k, "u": 0.1, "unit": "DN"} for k, name in enumerate(("K", "QE", "DR"))}
+    estimates = {f"sensor.{s}": [{"name": n, "value": 1.0, "u": 0.1} for n in "ab"] for s in ("prnu", "dsnu")}
+    matrix = [[float(r * c) for c in range(9)] for r in range(8)]
+    write_json(tmp_path / "a.json", {"schema": "x", "results": values, "estimates": estimates, "part": {"matrix": matrix}})
+    found = read_result(tmp_path / "a.json")
+    tables = {t.name: t for t in found.tables}
+    assert tables["results"].columns == ("of", "value", "u", "unit") and tables["results"].rows[1] == ("QE", 1, 0.1, "DN")
+    assert [row[:2] for row in tables["estimates"].rows] == [(f"sensor.{s}", n) for s in ("prnu", "dsnu") for n in "ab"]
+    assert [(m.name, m.to_record()["rows"], m.to_record()["cols"]) for m in found.maps] == [("part.matrix", 8, 9)]
 
 
 def test_what_is_damaged_or_no_result_is_refused(tmp_path: Path) -> None:

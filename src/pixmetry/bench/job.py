@@ -78,15 +78,15 @@ def told_apart(shown: Sequence[str | Path]) -> tuple[tuple[str | Path, ...], dic
     return tuple(shown), None
 
 
-def open_view(result: str | Path, picture: str | Path | None = None, *, port: int = 0, tell: Callable[[str], None] = print) -> None:
+def open_view(result: str | Path, pictures: Sequence[str | Path] = (), *, port: int = 0, tell: Callable[[str], None] = print) -> None:
     """Show a result on loopback until it is stopped.
 
     Parameters
     ----------
     result : path
         A folder of results, a JSON file, or a table, see `pixmetry.bench.result.read_result`.
-    picture : path, optional
-        An image that the positions belong to.
+    pictures : sequence of path
+        Images that the positions belong to, or folders of them.
     port, tell
         As of `open_bench`.
 
@@ -100,7 +100,7 @@ def open_view(result: str | Path, picture: str | Path | None = None, *, port: in
     from pixmetry.bench.result import read_result
     from pixmetry.bench.server import app_of_result
 
-    shown = read_result(result, picture)
+    shown = read_result(result, pictures)
     _serve(lambda token, own: app_of_result(shown, token, own), port, tell)
 
 

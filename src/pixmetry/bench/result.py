@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import csv
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,9 @@ RECORDS = ("results.json", "calibration.json", "sheet.json", "truth.json")  # of
 MOST_ROWS = 50_000  # of a table on the page
 MOST_SIDE = 2048  # of a map on the page: of a larger one every so many pixels are shown
 BIGGEST = 1 << 28  # bytes of a file
-RESIDUALS = ("residual_x_px", "residual_y_px")
+MOST_PICTURES = 1000
+LEAST_SIDE = 8  # of a matrix that is shown as a map
+MAIN = ("budget.rows", "rows", "results", "steps", "tests.parameters", "targets", "estimates")  # tables that say most of their result
 
 
 @dataclass(frozen=True)
@@ -37,11 +39,12 @@ class TableOfResult:
 
 @dataclass(frozen=True, eq=False)
 class MapOfResult:
-    """A map of values over pixels; ``step`` pixels of the frame lie from value to value."""
+    """A map of values over pixels; ``step`` pixels of the frame lie from value to value; ``frame``: positions may be drawn over it."""
 
     name: str
     values: np.ndarray
     step: int = 1
+    frame: bool = True
 
     def to_record(self) -> dict[str, Any]:
         """Return the plain record: the values as base64 of little-endian float32."""
@@ -52,10 +55,32 @@ class MapOfResult:
             "rows": self.values.shape[0],
             "cols": self.values.shape[1],
             "step": self.step,
+            "frame": self.frame,
             "low": low,
             "high": high if high > low else low + 1.0,
             "data": base64.b64encode(np.ascontiguousarray(self.values, "<f4").tobytes()).decode("ascii"),
         }
+
+
+@dataclass(frozen=True)
+class PictureOfResult:
+    """An image file that positions belong to; it is read when it is looked at."""
+
+    name: str
+    path: Path
+
+    def to_record(self) -> dict[str, Any]:
+        """Return the plain record, as of `MapOfResult`.
+
+        Raises
+        ------
+        InputError
+            If it cannot be read as a picture.
+        """
+        values = np.asarray(read_picture(self.path), float)
+        if values.ndim != 2:
+            raise InputError("not a picture of one channel", where=str(self.path), remedy="name a grey picture")
+        return _shown(self.name, values).to_record()
 
 
 @dataclass(frozen=True)
@@ -67,14 +92,15 @@ class Result:
     title, kind : str
         Its file, and the schema that it names.
     tables : tuple of TableOfResult
-    maps : tuple of MapOfResult
-        Those of its store, and the picture that was named beside it.
+        The one that says most first.
+    maps : tuple of MapOfResult or PictureOfResult
+        The pictures that its positions belong to, those of its store, and the matrices of its record.
     """
 
     title: str
     kind: str
     tables: tuple[TableOfResult, ...]
-    maps: tuple[MapOfResult, ...] = ()
+    maps: tuple[MapOfResult | PictureOfResult, ...] = ()
 
     def to_record(self) -> dict[str, Any]:
         """Return the plain record without the values of the maps."""
@@ -82,56 +108,93 @@ class Result:
         return {"title": self.title, "kind": self.kind, "tables": tables, "maps": [m.name for m in self.maps]}
 
 
-def read_result(path: str | Path, picture: str | Path | None = None) -> Result:
+def read_result(path: str | Path, pictures: Sequence[str | Path] = ()) -> Result:
     """Read a result: its folder, its JSON file, or a table (CSV).
 
     Parameters
     ----------
     path : path
         A folder that pixmetry wrote, a JSON file of any command, or a CSV table.
-    picture : path, optional
-        An image that the positions of the result belong to.
+    pictures : sequence of path
+        Images that the positions of the result belong to, or folders of them. Those of the result's own folder are found without.
 
     Raises
     ------
     InputError
-        If there is no result, or it is damaged.
+        If there is no result, or it is damaged, or a picture is missing.
     """
     path = Path(path)
     tables: list[TableOfResult] = []
-    maps: list[MapOfResult] = []
+    maps: list[MapOfResult | PictureOfResult] = []
     kind = "table"
     if path.is_dir():
         record = next((path / name for name in RECORDS if (path / name).is_file()), None)
         others = sorted(path.glob("*.json")) if record is None else [record]
         for file in others[:1]:
-            kind, found = _of_json(file)
-            tables += found
+            kind, tables, maps = _of_json(file)
         for file in sorted(path.glob("*.csv")):
             tables.append(_of_csv(file))
         for store in sorted([*path.glob("*.zarr.zip"), *path.glob("maps.zarr")]):
-            maps += _of_maps(store)
+            maps = [*_of_maps(store), *maps]
     elif path.suffix.lower() == ".csv":
         tables.append(_of_csv(path))
+    elif path.suffix.lower() in (".html", ".pdf") and path.is_file():
+        raise InputError("a page for a browser is no result", where=str(path), remedy="open it in a browser, or name the JSON beside it")
     elif path.is_file():
-        kind, found = _of_json(path)
-        tables += found
+        kind, tables, maps = _of_json(path)
     if not tables and not maps:
         allowed = "a folder of results, a JSON file of a command, or a CSV table"
         raise InputError("no result is found", where=str(path), allowed=allowed, remedy="check the name")
-    if picture is not None:
-        maps.insert(0, _shown(Path(picture).name, np.asarray(read_picture(picture), float)))
-    return Result(path.name, kind, tuple(tables), tuple(maps))
+    tables.sort(key=lambda t: MAIN.index(t.name) if t.name in MAIN else len(MAIN))
+    own = path if path.is_dir() else path.parent
+    return Result(path.name, kind, tuple(tables), (*_pictures(tables, own, [Path(p) for p in pictures]), *maps))
 
 
-def _of_json(path: Path) -> tuple[str, list[TableOfResult]]:
+def _pictures(tables: Sequence[TableOfResult], own: Path, named: Sequence[Path]) -> list[PictureOfResult]:
+    """Pictures that were named, and those of the tables that lie in the folder of the result or in a folder that was named."""
+    found: dict[str, Path] = {}
+    for path in named:
+        if path.is_file():
+            found[path.name] = path
+        elif not path.is_dir():
+            raise InputError("there is no such picture", where=str(path), remedy="check the name")
+    of_tables = [t for t in tables if {"x_px", "y_px"} <= set(t.columns)]
+    names = {str(row[t.columns.index(c)]) for t in of_tables for c in ("image", "file") if c in t.columns for row in t.rows}
+    for name in sorted({Path(n).name for n in names} - {""})[:MOST_PICTURES]:
+        for folder in [p for p in (*named, own) if p.is_dir()]:
+            if name not in found and (folder / name).is_file():
+                found[name] = folder / name
+    return [PictureOfResult(name, path) for name, path in found.items()]
+
+
+def _of_json(path: Path) -> tuple[str, list[TableOfResult], list[MapOfResult | PictureOfResult]]:
     if path.stat().st_size > BIGGEST:
         raise InputError("the file is too large to be shown", where=str(path), allowed=f"up to {BIGGEST >> 20} MB")
     record = parse_json(path.read_bytes(), str(path))
     if "checksums" in record:
         check_record(record, str(path))
     shown = {k: v for k, v in record.items() if k not in ("checksums", "schema")}
-    return str(record.get("schema", "JSON")), [t for t in _tables_in(shown, "") if t.rows]
+    return str(record.get("schema", "JSON")), [t for t in _tables_in(shown, "") if t.rows], list(_matrices_in(shown, ""))
+
+
+def _matrices_in(value: Mapping[str, Any], at: str) -> Iterator[MapOfResult]:
+    """Lists of lists of numbers, all of one length, as maps."""
+    for key, part in value.items():
+        name = f"{at}.{key}" if at else str(key)
+        if isinstance(part, dict):
+            yield from _matrices_in(part, name)
+        elif isinstance(part, list) and part and all(isinstance(p, dict) for p in part):
+            for k, p in enumerate(part[:MOST_PICTURES]):
+                yield from _matrices_in(p, f"{name}.{p.get('name', k)}")
+        elif _is_matrix(part):
+            yield replace(_shown(name, np.array(part, float)), frame=False)
+
+
+def _is_matrix(part: Any) -> bool:
+    if not isinstance(part, list) or len(part) < LEAST_SIDE or not all(isinstance(row, list) for row in part):
+        return False
+    wide = len(part[0])
+    return wide >= LEAST_SIDE and all(len(row) == wide and all(v is None or isinstance(v, int | float) for v in row) for row in part)
 
 
 def _tables_in(value: Mapping[str, Any], at: str) -> Iterator[TableOfResult]:
@@ -141,12 +204,31 @@ def _tables_in(value: Mapping[str, Any], at: str) -> Iterator[TableOfResult]:
         yield TableOfResult(at or "values", ("name", "value"), tuple((k, _cell(v)) for k, v in single))
     for key, part in value.items():
         name = f"{at}.{key}" if at else str(key)
-        if isinstance(part, list) and part and all(isinstance(p, dict) for p in part):
+        if _is_records(part):
             yield _of_records(name, part)
+        elif isinstance(part, dict) and (named := _named_records(part)):
+            yield _of_records(name, named)
         elif isinstance(part, dict) and _is_columns(part):
             yield _of_columns(name, part)
         elif isinstance(part, dict):
             yield from _tables_in(part, name)
+
+
+def _is_records(part: Any) -> bool:
+    return isinstance(part, list) and bool(part) and all(isinstance(p, dict) for p in part)
+
+
+def _named_records(part: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The rows of records by name that are alike (or lists of such), each row with its name; none if they are not."""
+    rows: list[dict[str, Any]] = []
+    for name, value in part.items():
+        of_name = value if _is_records(value) else [value]
+        if not all(isinstance(v, dict) and not any(isinstance(x, dict | list) and not _is_short(x) for x in v.values()) for v in of_name):
+            return []
+        rows += [{"of": name} | v for v in of_name]
+    first = set(rows[0]) if rows else set()
+    alike = len(part) > 1 and len(first) > 2 and all(len(set(r) & first) > 0.5 * max(len(r), len(first)) for r in rows)
+    return rows if alike else []
 
 
 def _is_short(value: Any) -> bool:
@@ -182,7 +264,7 @@ def _flattened(record: Mapping[str, Any], at: str = "") -> Iterator[tuple[str, A
         name = f"{at}{key}"
         if isinstance(value, dict) and len(value) <= 12 and not at:
             yield from _flattened(value, f"{name}.")
-        else:
+        elif not _is_matrix(value):  # it is a map
             yield name, _cell(value)
 
 

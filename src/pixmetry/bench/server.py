@@ -294,7 +294,7 @@ def app_of_result(result: Result, token: str, port: int) -> Starlette:
     from starlette.responses import JSONResponse, Response
     from starlette.routing import Route
 
-    page = page_route("view.html")
+    gate, page = Gate(), page_route("view.html")
 
     async def record(request: Request) -> Response:
         return JSONResponse(finite(result.to_record()))
@@ -303,7 +303,10 @@ def app_of_result(result: Result, token: str, port: int) -> Starlette:
         number = request.path_params["number"]
         if number >= len(result.maps):
             return Response("there is no such map", 404)
-        return JSONResponse(result.maps[number].to_record())
+        try:
+            return JSONResponse(await gate.run(_page_of(request), "map", lambda go_on: result.maps[number].to_record()))
+        except (PixmetryError, Refused, Overtaken) as problem:
+            return _problem(problem)
 
     routes = [Route("/", page), Route("/result", record), Route("/map/{number:int}", values), Route("/{name}", page)]
     return Starlette(routes=routes, middleware=[Middleware(Guard, token=token, hosts=hosts_of(port))])

@@ -7,6 +7,7 @@ from pathlib import Path
 import click
 
 from pixmetry.cli._console import echo
+from pixmetry.cli._json import JsonResult, json_option
 from pixmetry.cli._pdf import check_pdf, pdf_option, put_pdf
 
 
@@ -43,6 +44,7 @@ from pixmetry.cli._pdf import check_pdf, pdf_option, put_pdf
 )
 @click.option("--off", multiple=True, metavar="NAME", help="Switch an error source off. May be repeated.")
 @pdf_option()
+@json_option("the steps with their images")
 def chain(
     camera: str,
     scene: Path,
@@ -54,6 +56,7 @@ def chain(
     settings: tuple[str, ...],
     off: tuple[str, ...],
     pdf: Path | None,
+    json_file: Path | None,
 ) -> None:
     """Show on one page how each error source of a camera moves a target.
 
@@ -70,7 +73,11 @@ def chain(
 
     check_files([Output(output, page_mark(TITLE))], [scene, Path(camera)])  # before the work
     check_pdf(pdf, [scene, Path(camera)])
+    written = JsonResult(json_file, "pixmetry/chain/1", inputs=[scene, Path(camera)])
     changed = changed_camera(load_camera(camera), parse_overrides(settings), off)
     walk = follow(changed, scene, target=target, frame=frame, seed=seed, draws=draws)
-    echo(f"page: {write_chain_page(walk, output)}")
+    page = write_chain_page(walk, output)
+    written.put(walk.to_record())
+    if not written.printed:
+        echo(f"page: {page}")
     put_pdf(pdf, lambda: page_of(walk))

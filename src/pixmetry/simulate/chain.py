@@ -22,6 +22,10 @@ MARGIN_PX = 8  # around the target
 DRAW_STRIDE = 1_000_003  # between the seeds of several draws
 
 
+def _axes(pairs: Mapping[str, tuple[float, float] | None]) -> dict[str, float | None]:
+    return {f"{n}_{axis}_px": None if p is None else float(p[k]) for n, p in pairs.items() for k, axis in enumerate("xy")}
+
+
 @dataclass(frozen=True)
 class Step:
     """The target after one source.
@@ -56,6 +60,12 @@ class Step:
     moved: tuple[float, float] | None
     expected_moved: tuple[float, float] | None
 
+    def to_record(self) -> dict[str, Any]:
+        """Return the plain record; positions in px, x and y apart."""
+        pairs = {"error": self.error, "moved": self.moved, "expected_error": self.expected_error, "expected_moved": self.expected_moved}
+        images = {"col0": self.origin[0], "row0": self.origin[1], "unit": self.unit, "image": self.image.tolist()}
+        return {"name": self.name, "source_id": self.source_id, "title": self.title} | _axes(pairs) | images
+
 
 @dataclass(frozen=True)
 class Spread:
@@ -79,6 +89,11 @@ class Spread:
     place: tuple[float, float]
     time: tuple[float, float]
 
+    def to_record(self) -> dict[str, Any]:
+        """Return the plain record; in px, x and y apart."""
+        parts = _axes({"constant": self.constant, "place": self.place, "time": self.time})
+        return {"name": self.name, "source_id": self.source_id, "title": self.title} | parts
+
     @property
     def square(self) -> float:
         """Everything together, squared."""
@@ -101,6 +116,19 @@ class Walk:
         """The sources that moved the centre in this frame, the strongest first."""
         by = [(float(np.hypot(*s.moved)), s) for s in self.steps[1:] if s.moved is not None]
         return [step for px, step in sorted(by, key=lambda pair: -pair[0]) if px > 1e-6]
+
+    def to_record(self) -> dict[str, Any]:
+        """Return the plain record, schema ``pixmetry/chain/1``."""
+        return {
+            "schema": "pixmetry/chain/1",
+            "camera": self.camera.name,
+            "target": dict(self.target),
+            "frame": self.frame,
+            "seed": self.seed,
+            "draws": self.draws,
+            "steps": [s.to_record() for s in self.steps],
+            "spread": [s.to_record() for s in self.spread],
+        }
 
 
 def chain(camera: str | Path | Camera, scene: Any, *, target: int | None = None, frame: int = 0, seed: int = 0, draws: int = 1) -> Walk:

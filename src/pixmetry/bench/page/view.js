@@ -22,10 +22,10 @@ function drawTable(t) {
     const order = (a, b) => (a === null ? 1 : b === null ? -1 : typeof a === "number" && typeof b === "number" ? a - b : String(a).localeCompare(String(b), "en", { numeric: true }));
     rows = [...rows].sort((a, b) => (key(a) === null || key(b) === null ? order(key(a), key(b)) : (t.up ? 1 : -1) * order(key(a), key(b))));
   }
-  const number = t.columns.map((_, k) => t.rows.slice(0, 50).some((r) => typeof r[k] === "number"));
-  const head = t.columns.map((c, k) => el("th", { scope: "col", class: number[k] ? "n" : "", "aria-sort": t.by === k ? (t.up ? "ascending" : "descending") : "none" },
-    el("button", { type: "button", onclick: () => { t.up = t.by === k ? !t.up : true; t.by = k; drawTable(t); } }, `${c}${t.by === k ? (t.up ? " ▲" : " ▼") : ""}`)));
-  const body = rows.slice(0, t.most).map((row) => el("tr", {}, row.map((v, k) => el("td", { class: number[k] ? "n" : "" },
+  const number = t.columns.map((_, k) => t.rows.slice(0, 50).some((r) => typeof r[k] === "number")), places = t.columns.includes("x_px") && t.columns.includes("y_px");
+  const head = [...(places ? [el("th", { scope: "col", class: "hint" }, "map")] : []), ...t.columns.map((c, k) => el("th", { scope: "col", class: number[k] ? "n" : "", "aria-sort": t.by === k ? (t.up ? "ascending" : "descending") : "none" },
+    el("button", { type: "button", onclick: () => { t.up = t.by === k ? !t.up : true; t.by = k; drawTable(t); } }, `${c}${t.by === k ? (t.up ? " ▲" : " ▼") : ""}`)))];
+  const body = rows.slice(0, t.most).map((row) => el("tr", {}, places ? el("td", {}, el("button", { type: "button", "aria-label": "show on the map", title: "show on the map", onclick: () => goTo(t, row) }, "⌖")) : null, row.map((v, k) => el("td", { class: number[k] ? "n" : "" },
     source(v) ? el("button", { type: "button", title: "what the result says of this source", onclick: () => evidence(v) }, v) : v === null ? "" : typeof v === "number" ? digits(v, 6) : String(v)))));
   const more = rows.length > t.most ? el("button", { type: "button", onclick: () => { t.most *= 5; drawTable(t); } }, `more of ${rows.length} rows`) : null;
   t.box.hidden = rows.length === 0;
@@ -37,7 +37,8 @@ function drawTable(t) {
 function evidence(name) {
   $("find").value = name;
   const map = result.maps.findIndex((m) => m.includes(name.split(".")[1]));
-  if (map >= 0) { $("map").value = map; load(); }
+  if (map >= 0) showMap(map);
+  for (const t of tables) t.filter = t.own.value = "";
   redraw();
   for (const t of tables) t.box.open = !t.box.hidden;
   $("find").scrollIntoView({ block: "start" });
@@ -50,6 +51,7 @@ for (const t of tables) {
   t.count = el("span", { class: "hint" });
   t.body = el("div");
   const own = el("input", { type: "search", placeholder: "in this table", "aria-label": `find in ${t.name}`, oninput: () => { t.filter = own.value; drawTable(t); } });
+  t.own = own;
   t.box = el("details", {}, el("summary", {}, t.name, t.count), el("div", { class: "row" }, own), t.body);
   t.count.textContent = ` ${t.rows.length} row${t.rows.length === 1 ? "" : "s"}`;
   t.box.addEventListener("toggle", () => { if (t.box.open) drawTable(t); });
@@ -69,13 +71,33 @@ if (result.maps.length || placed.length) {
   $("map").append(...(result.maps.length ? [] : [el("option", { value: -1 }, "none")]), ...result.maps.map((m, k) => el("option", { value: k }, m)));
   $("points").append(el("option", { value: -1 }, "none"), ...placed.map((t, k) => el("option", { value: k }, t.name)));
   if (placed.length) $("points").value = 0;
+  showImages();
+  const first = result.maps.findIndex((m) => [...$("image").options].some((o) => o.value === m));
+  if (first >= 0) $("image").value = result.maps[first];
+  await showMap(Math.max(first, 0));
+}
+
+// Show a map; if it is the picture of an image of the table, the positions of that image alone.
+async function showMap(k) {
+  const name = result.maps[k];
+  $("map").value = result.maps.length ? k : -1;
+  if ([...$("image").options].some((o) => o.value === name)) $("image").value = name;
+  choosePoints();
   await load();
 }
 
 async function load() {
-  const k = Number($("map").value);
+  const k = Number($("map").value), mine = (view.asked = {});
   if (k >= 0) {
-    const map = await (await fetch(`map/${k}`)).json();
+    let map;
+    try {
+      map = await (await fetch(`map/${k}`)).json();
+    } catch {
+      map = { error: "the server does not answer: is the command still running?" };
+    }
+    if (view.asked !== mine) return; // another was chosen meanwhile
+    $("said").textContent = map.error ?? "";
+    if (map.error || map.overtaken) return;
     const values = new Float32Array(Uint8Array.from(atob(map.data), (c) => c.charCodeAt(0)).buffer);
     const canvas = el("canvas"), image = new ImageData(map.cols, map.rows);
     canvas.width = map.cols;
@@ -85,26 +107,53 @@ async function load() {
       image.data.set(Number.isFinite(values[i]) ? [grey, grey, grey, 255] : [200, 0, 80, 255], 4 * i);
     }
     canvas.getContext("2d").putImageData(image, 0, 0);
+    const same = view.map && view.map.cols * view.map.step === map.cols * map.step && view.map.rows * view.map.step === map.rows * map.step;
     Object.assign(view, { map: { ...map, values }, canvas });
+    if (same) { draw(); return; } // the part that is looked at stays
   }
-  choosePoints();
   whole();
 }
 
-function choosePoints() {
-  const t = placed[Number($("points").value)];
-  const at = t ? Object.fromEntries(t.columns.map((c, k) => [c, k])) : {};
-  const images = t && "image" in at ? [...new Set(t.rows.map((r) => r[at.image]))] : [];
-  const before = $("image").value;
-  $("image").replaceChildren(el("option", { value: "" }, "all"), ...images.map((name) => el("option", { value: name }, String(name))));
+// A row of a table of positions, in the middle of the map.
+async function goTo(t, row) {
+  const at = Object.fromEntries(t.columns.map((c, k) => [c, k]));
+  $("points").value = placed.indexOf(t);
+  showImages();
+  const image = "image" in at ? String(row[at.image]) : "", map = result.maps.indexOf(image);
+  $("image").value = image;
+  if (map >= 0 && map !== Number($("map").value)) await showMap(map);
+  choosePoints();
+  if (row[at.x_px] === null || row[at.y_px] === null) return;
+  const [w] = size();
+  view.zoom = Math.max(view.zoom, (8 * sheet.width) / w);
+  view.x = row[at.x_px] + 0.5 - sheet.width / view.zoom / 2;
+  view.y = row[at.y_px] + 0.5 - sheet.height / view.zoom / 2;
+  draw();
+  $("under").textContent = told(t.columns, row);
+  sheet.scrollIntoView({ block: "nearest" });
+  sheet.focus();
+}
+
+const told = (columns, row) => columns.map((c, k) => `${c} ${typeof row[k] === "number" ? digits(row[k], 5) : row[k] ?? "–"}`).slice(0, 10).join(", ");
+
+function columnsOf(t) { return t ? Object.fromEntries(t.columns.map((c, k) => [c, k])) : {}; }
+
+function showImages() {
+  const t = placed[Number($("points").value)], at = columnsOf(t), before = $("image").value;
+  const images = t && "image" in at ? [...new Set(t.rows.map((r) => String(r[at.image])))] : [];
+  $("image").replaceChildren(el("option", { value: "" }, "all"), ...images.map((name) => el("option", { value: name }, name)));
   if (images.includes(before)) $("image").value = before;
-  view.points = (t?.rows ?? []).filter((r) => !$("image").value || String(r[at.image]) === $("image").value).filter((r) => r[at.x_px] !== null)
+}
+
+function choosePoints() {
+  const t = placed[Number($("points").value)], at = columnsOf(t);
+  view.points = (t?.rows ?? []).filter((r) => !$("image").value || String(r[at.image]) === $("image").value).filter((r) => r[at.x_px] !== null && r[at.y_px] !== null)
     .map((r) => ({ x: r[at.x_px], y: r[at.y_px], dx: "residual_x_px" in at ? r[at.residual_x_px] : null, dy: "residual_y_px" in at ? r[at.residual_y_px] : null, row: r, columns: t.columns }));
 }
 
 function size() {
   if (view.map) return [view.map.cols * view.map.step, view.map.rows * view.map.step];
-  return [Math.max(1, ...view.points.map((p) => p.x)) + 10, Math.max(1, ...view.points.map((p) => p.y)) + 10];
+  return ["x", "y"].map((axis) => view.points.reduce((most, p) => Math.max(most, p[axis]), 1) + 10);
 }
 
 function whole() {
@@ -127,14 +176,14 @@ function draw() {
   if (view.canvas) pen.drawImage(view.canvas, -x * zoom, -y * zoom, view.canvas.width * view.map.step * zoom, view.canvas.height * view.map.step * zoom);
   pen.lineWidth = 1.5 * devicePixelRatio;
   const r = 3 * devicePixelRatio;
-  for (const p of view.points) {
+  for (const p of view.map?.frame === false ? [] : view.points) {
     const [px, py] = [(p.x + 0.5 - x) * zoom, (p.y + 0.5 - y) * zoom];
     if (px < -50 || py < -50 || px > sheet.width + 50 || py > sheet.height + 50) continue;
     pen.strokeStyle = "#39a7ff";
     pen.beginPath();
     pen.moveTo(px - r, py); pen.lineTo(px + r, py); pen.moveTo(px, py - r); pen.lineTo(px, py + r);
     pen.stroke();
-    if (p.dx === null) continue;
+    if (p.dx === null || p.dy === null) continue;
     pen.strokeStyle = "#ffb03a";
     pen.beginPath();
     pen.moveTo(px, py); pen.lineTo(px + p.dx * scale * zoom, py + p.dy * scale * zoom);
@@ -160,21 +209,33 @@ function tell(event) {
     const col = Math.floor((x + 0.5) / view.map.step), row = Math.floor((y + 0.5) / view.map.step);
     if (col >= 0 && row >= 0 && col < view.map.cols && row < view.map.rows) words += `; ${view.map.name} ${digits(view.map.values[row * view.map.cols + col], 5)}`;
   }
-  const near = view.points.map((p) => [Math.hypot(p.x - x, p.y - y), p]).sort((a, b) => a[0] - b[0])[0];
-  if (near && near[0] * view.zoom < 12 * devicePixelRatio) words += `; ${near[1].columns.map((c, k) => `${c} ${typeof near[1].row[k] === "number" ? digits(near[1].row[k], 5) : near[1].row[k]}`).slice(0, 10).join(", ")}`;
+  let near = null, least = (12 * devicePixelRatio) / view.zoom;
+  for (const p of view.points) {
+    const far = Math.hypot(p.x - x, p.y - y);
+    if (far < least) [near, least] = [p, far];
+  }
+  if (near) words += `; ${told(near.columns, near.row)}`;
   $("under").textContent = words;
   return [px, py];
 }
 
-let held = null;
-sheet.addEventListener("pointerdown", (e) => { held = tell(e); sheet.setPointerCapture(e.pointerId); });
-sheet.addEventListener("pointerup", () => { held = null; });
+// One pointer moves the map, two zoom it.
+const held = new Map();
+const drop = (e) => held.delete(e.pointerId);
+sheet.addEventListener("pointerdown", (e) => { held.set(e.pointerId, tell(e)); sheet.setPointerCapture(e.pointerId); });
+for (const kind of ["pointerup", "pointercancel"]) sheet.addEventListener(kind, drop);
 sheet.addEventListener("pointermove", (e) => {
-  const now = tell(e);
-  if (!held) return;
-  view.x -= (now[0] - held[0]) / view.zoom;
-  view.y -= (now[1] - held[1]) / view.zoom;
-  held = now;
+  const now = tell(e), before = held.get(e.pointerId);
+  if (!before) return;
+  const other = [...held].find(([id]) => id !== e.pointerId)?.[1];
+  held.set(e.pointerId, now);
+  if (other) {
+    const apart = (p) => Math.max(Math.hypot(p[0] - other[0], p[1] - other[1]), 1);
+    zoomAt(apart(now) / apart(before), (now[0] + other[0]) / 2, (now[1] + other[1]) / 2);
+    return;
+  }
+  view.x -= (now[0] - before[0]) / view.zoom;
+  view.y -= (now[1] - before[1]) / view.zoom;
   draw();
 });
 sheet.addEventListener("wheel", (e) => { e.preventDefault(); zoomAt(Math.exp(-e.deltaY / 400), ...tell(e)); }, { passive: false });
@@ -187,8 +248,14 @@ sheet.addEventListener("keydown", (e) => {
 $("closer").addEventListener("click", () => zoomAt(1.4));
 $("farther").addEventListener("click", () => zoomAt(1 / 1.4));
 $("whole").addEventListener("click", whole);
-$("map").addEventListener("change", load);
-for (const id of ["points", "image"]) $(id).addEventListener("change", () => { choosePoints(); draw(); });
+$("map").addEventListener("change", () => showMap(Number($("map").value)));
+$("points").addEventListener("change", () => { showImages(); choosePoints(); draw(); });
+$("image").addEventListener("change", () => {
+  const map = result.maps.indexOf($("image").value);
+  if (map >= 0) showMap(map);
+  else { choosePoints(); draw(); }
+});
 $("scale").addEventListener("input", draw);
-window.addEventListener("resize", whole);
+let wide = innerWidth;
+window.addEventListener("resize", () => { if (innerWidth !== wide) { wide = innerWidth; whole(); } }); // a telephone hides its bar: that is no reason
 document.body.dataset.ready = "1";
