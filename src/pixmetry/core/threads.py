@@ -124,10 +124,21 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_forget_pools)
 
 
+def checked_threads(count: int | None) -> int | None:
+    """The number of threads that an argument asks for, None for that of `thread_count`.
+
+    Raises
+    ------
+    InputError
+        If it is not a whole number of at least 1.
+    """
+    return None if count is None else _checked(count, "threads")
+
+
 def _checked(count: int | str, where: str) -> int:
     try:
         number = int(count)
-    except ValueError:
+    except (TypeError, ValueError, OverflowError):
         number = 0
     if number < 1 or str(number) != str(count).strip():
         raise InputError("not a number of threads", where=where, value=count, allowed="a whole number of at least 1")

@@ -7,7 +7,7 @@ from importlib import import_module
 
 import numpy as np
 
-from pixmetry.core.errors import InputError
+from pixmetry.core.arguments import choice
 from pixmetry.locate.detect.targets import Flag, Targets
 from pixmetry.locate.estimator import Method
 from pixmetry.locate.noise import NoiseModel
@@ -33,6 +33,7 @@ MOST_LOBES = 6  # regions of one beam, or of a few: more may be a field of spots
 LOBES_APART, BEAMS_APART = 3.0, 10.0  # distances, over half the width at half height: of the lobes of one beam; of apertures of two
 BEAM_PX, BEAM_RATIO = 4.0, 0.8  # half the width of spots at half height from which, ratio of their axes below which they are beams
 SPOTS = ("disc", "ellipse", "ring", "spot")
+KINDS = (*SPOTS, "blob", "line", "edge", "cross", "chessboard", "coded")
 FEW_ELECTRONS = 50.0  # at a target's peak: below, the errors of a grey value are visibly no normal ones
 TILTED, TILTED_PX = 0.91, 0.3  # ratio of the axes below which, difference of half axes above which discs are fitted as ellipses
 LARGE_PX = 2.0  # radius from which that ratio can be told from a look at the region
@@ -65,6 +66,7 @@ def estimators(kind: str) -> dict[str, str]:
     >>> list(estimators("line"))[:2]
     ['auto', 'template']
     """
+    choice(kind, KINDS, "kind", "no such kind of target")
     if kind == "blob":
         return {AUTO: AUTO_TEXT, BLOB: BLOB_TEXT}
     if kind == "spot":
@@ -73,11 +75,7 @@ def estimators(kind: str) -> dict[str, str]:
         return {AUTO: AUTO_TEXT} | {name: method.text for name, method in methods().items()}
     if kind == "line":
         return {AUTO: AUTO_TEXT, **ROWS}
-    if kind in ("edge", "cross", "chessboard"):
-        return {AUTO: AUTO_TEXT, "template": "least squares with the target's own shape, integrated over the pixel"}
-    raise InputError(
-        "no such kind of target", value=kind, allowed=", ".join((*SPOTS, "blob", "line", "edge", "cross", "chessboard", "coded"))
-    )
+    return {AUTO: AUTO_TEXT, "template": "least squares with the target's own shape, integrated over the pixel"}
 
 
 def seen_shape(kind: str, targets: Targets) -> tuple[str, str]:

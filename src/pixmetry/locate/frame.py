@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from pixmetry.core.arguments import whole_number
 from pixmetry.core.errors import InputError
 from pixmetry.locate.noise import NoiseModel
 
@@ -86,8 +87,7 @@ def scale_ends(frame: np.ndarray, bits: int | None, noise: NoiseModel | None) ->
         low = 0.0 if frame.min() == 0 and black else -np.inf
         return low, high if _cut_off_at(frame, high, NEAR_END * (high - float(frame.min()))) else np.inf
     if bits is not None:
-        if bits not in range(1, 17):
-            raise InputError("the bits of a value cannot be used", where="bits", value=bits, allowed="1 to 16")
+        bits = whole_number(bits, "bits", "the bits of a value cannot be used", least=1, most=16, allowed="1 to 16")
         high = float((1 << int(bits)) - 1)
         if frame.max() > high:
             raise InputError("grey values that have more bits", where="bits", value=int(frame.max()), allowed=f"up to {high:.0f}")

@@ -10,7 +10,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pixmetry.camera.camera import Camera
+from pixmetry.core.arguments import choice, number
 from pixmetry.core.errors import InputError
+from pixmetry.core.threads import checked_threads
 from pixmetry.locate.detect.blocks import checked_steps
 from pixmetry.locate.detect.coded import RINGS_OF_12, segments_of
 from pixmetry.locate.detect.detection import FALSE_ALARMS, THRESHOLD_SIGMA
@@ -134,21 +136,19 @@ def locate(
     >>> bool(abs(found.columns["x_px"][0] - 24.3) < 0.02), bool(0 < found.columns["var_x_px2"][0] < 0.02**2)
     (True, True)
     """
-    known = estimators(kind)
-    if estimator not in known:
-        raise InputError(f"no such estimator for kind {kind}", value=estimator, allowed=", ".join(known))
-    if polarity not in ("auto", "bright", "dark"):
-        raise InputError("no such polarity", value=polarity, allowed="auto, bright, dark")
-    if light_on not in ("surface", "image"):
-        raise InputError("light cannot act there", where="light_on", value=light_on, allowed="surface, image")
-    if not 0 <= aperture_px <= 1:
-        raise InputError("the pixel's aperture cannot be used", where="aperture_px", value=aperture_px, allowed="0 to 1 pixel")
+    choice(estimator, estimators(kind), "estimator", f"no such estimator for kind {kind}")
+    choice(polarity, ("auto", "bright", "dark"), "polarity", "no such polarity")
+    choice(light_on, ("surface", "image"), "light_on", "light cannot act there")
+    aperture_px = number(aperture_px, "aperture_px", "the pixel's aperture cannot be used", least=0, most=1, allowed="0 to 1 pixel")
     if aperture_px < 1 and estimator in methods() and not methods()[estimator].knows_aperture:
         what = f"the uncertainty of {estimator} is known only for pixels without gaps"
         remedy = "use the template, whose model includes the aperture"
         raise InputError(what, where="aperture_px", value=aperture_px, allowed="1", remedy=remedy)
-    if planes not in PLANES:
+    if not (isinstance(planes, str | bool) and planes in PLANES):
         raise InputError("no such choice of planes", where="planes", value=planes, allowed="auto, never, always")
+    threads = checked_threads(threads)
+    if not isinstance(name, str):
+        raise InputError("not a name", where="name", value=name, allowed="a text")
     segments = segments_of(dictionary)
     limits = Limits(rois, mask, places_px, diameter_px, contrast_dn, threshold_sigma, false_alarms)
     if limits.given and kind in WORK and kind != "blob":

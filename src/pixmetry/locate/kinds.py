@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -467,15 +468,17 @@ def wanted_grid(grid: str | tuple[int, int] | None, kind: str) -> Wanted | None:
         raise InputError(f"targets of kind {kind} form no grid", where="grid", allowed="disc, ellipse, ring, spot, chessboard")
     if grid is None:
         return None
+    if not isinstance(grid, str | Sequence | np.ndarray):
+        raise InputError("not the size of a grid", where="grid", value=grid, allowed="COLSxROWS, such as 9x6, or (cols, rows)")
     text, _, rows_are = grid.lower().partition(":") if isinstance(grid, str) else ("", "", "")
     if text in ROWS_ARE:
         text, rows_are = "any", text
     if kind != "chessboard" and text == "any" and rows_are in ("", *ROWS_ARE):
         return Wanted(None, rows_are)
-    size = tuple(text.split("x")) if isinstance(grid, str) else tuple(grid)
     try:
+        size = tuple(text.split("x")) if isinstance(grid, str) else tuple(grid)
         cols, rows = (int(v) for v in size)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         cols = rows = 0
     if cols < 2 or rows < 2 or (rows_are and (kind == "chessboard" or rows_are not in ROWS_ARE)):
         allowed = "COLSxROWS, such as 9x6, both at least 2"

@@ -122,6 +122,9 @@ def known_camera(with_: KnownCamera | Camera | str | Path) -> KnownCamera:
         return with_
     maps: dict[str, np.ndarray] = {}
     bits = None
+    if not isinstance(with_, Camera | str | Path):
+        allowed = "the folder of an assessment, a camera file or preset, a Camera"
+        raise InputError("not a camera", where="with_", value=with_, allowed=allowed)
     if isinstance(with_, Camera):
         camera = with_
     elif Path(with_).is_dir() or Path(with_).suffix.lower() == ".json":

@@ -262,6 +262,9 @@ def noise_model(noise: NoiseModel | Camera | str | Path | None) -> NoiseModel | 
     if noise is None or isinstance(noise, NoiseModel):
         return noise
     if not isinstance(noise, Camera):
+        if not isinstance(noise, str | Path):
+            allowed = "a NoiseModel, a Camera, the name of one, or read=…,gain=…,black=…"
+            raise InputError("not a noise", where="noise", value=noise, allowed=allowed)
         text = str(noise)
         if "=" in text:
             return parse_noise(text)[0]

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from pixmetry.core.arguments import choice, number
 from pixmetry.core.errors import InputError
 from pixmetry.locate.bound import closed_bounds as closed
 from pixmetry.locate.bound.fisher import Bound, bound_of, cramer_rao_bound, pixel_noise
@@ -162,6 +163,9 @@ def bound(
     >>> 0.005 < found.u_px < 0.05, found.predictions[0].name
     (True, 'template')
     """
+    pattern_dn = number(pattern_dn, "pattern_dn", "the fixed pattern cannot be used", least=0, most=1e12, allowed="0 to 1e12 DN")
+    if not isinstance(rounded, bool | np.bool_):
+        raise InputError("neither rounded nor not", where="rounded", value=rounded, allowed="True, False")
     if isinstance(noise, str):
         noise, own_pattern_dn = parse_noise(noise, rounded)
         pattern_dn = float(np.hypot(pattern_dn, own_pattern_dn))
@@ -170,8 +174,7 @@ def bound(
         what, remedy = "an error over the sub-pixel phase does not show in so few phases", "for the bound alone: cramer_rao_bound"
         raise InputError(what, where="phases", value=phases, allowed=f"{LEAST_PHASES} to 50", remedy=remedy)
     names = names_for(kind)
-    if estimator not in names:
-        raise InputError(f"this estimator cannot be predicted for a {kind}", where="estimator", value=estimator, allowed=", ".join(names))
+    choice(estimator, names, "estimator", f"this estimator cannot be predicted for a {kind}")
     pixels = pixel_noise(images, noise, rounded, pattern_dn, frames)
     asked = images.subset(unknowns)
     bounds = {"asked": bound_of(images, pixels, asked, noise, rounded)}

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pixmetry.core.arguments import number, whole_number
 from pixmetry.core.errors import InputError
 from pixmetry.locate.bound.predictions import PixelNoise
 from pixmetry.locate.noise import ROUNDING_DN2, NoiseModel
@@ -121,10 +122,10 @@ def pixel_noise(images: Images, noise: NoiseModel, rounded: bool = True, pattern
     InputError
         If a number cannot be used, or there is next to no noise.
     """
-    if frames < 1 or frames != int(frames):
-        raise InputError("the number of frames cannot be used", where="frames", value=frames, allowed="1 or more")
-    if not (np.isfinite(pattern_dn) and pattern_dn >= 0):
-        raise InputError("the fixed pattern cannot be used", where="pattern_dn", value=pattern_dn, allowed="0 or more")
+    frames = whole_number(frames, "frames", "the number of frames cannot be used", least=1, allowed="1 or more")
+    pattern_dn = number(pattern_dn, "pattern_dn", "the fixed pattern cannot be used", least=0, most=1e12, allowed="0 to 1e12 DN")
+    if not isinstance(noise, NoiseModel):
+        raise InputError("not a noise", where="noise", value=noise, allowed="a NoiseModel, or read=…,gain=…,bits=…")
     level = images.mean
     seen = np.clip(level, noise.low_dn, noise.high_dn)
     light = np.maximum(seen - noise.black_dn, 0.0)

@@ -79,7 +79,10 @@ def checked_steps(steps: ArrayLike) -> np.ndarray:
     InputError
         If they are not 64 numbers from 1 on.
     """
-    table = np.asarray(steps, float)
+    try:
+        table = np.asarray(steps, float)
+    except (TypeError, ValueError):
+        table = np.empty(0)
     if table.size != BLOCK * BLOCK or not (np.isfinite(table).all() and (table >= 1).all()):
         raise InputError("not the steps of a quantiser", where="jpeg_steps", value=table.shape, allowed="8 × 8 numbers, 1 or more")
     return table.reshape(BLOCK, BLOCK)

@@ -15,6 +15,7 @@ from functools import cache
 
 import numpy as np
 
+from pixmetry.core.arguments import choice
 from pixmetry.core.errors import InputError
 from pixmetry.core.threads import map_tiles
 
@@ -58,9 +59,7 @@ def segments_of(dictionary: str) -> int:
     InputError
         If there is no such set.
     """
-    if dictionary not in RINGS:
-        raise InputError("no such rings of coded targets", where="dictionary", value=dictionary, allowed=", ".join(RINGS))
-    return int(dictionary.removeprefix("RING_"))
+    return int(choice(dictionary, RINGS, "dictionary", "no such rings of coded targets").removeprefix("RING_"))
 
 
 @cache

@@ -58,6 +58,9 @@ class Limits:
             pair = getattr(self, name)
             if pair is not None and not _is_range(pair):
                 raise InputError("not a range", where=name, value=pair, allowed="least and greatest, 0 or more, such as (3, 40)")
+        if self.rois is not None and not (isinstance(self.rois, Sequence | np.ndarray) and np.ndim(self.rois) != 0):
+            allowed = "a list of (row, col, rows, cols)"
+            raise InputError("not a list of regions", where="rois", value=self.rois, allowed=allowed)
         if self.rois is not None and not len(self.rois):
             raise InputError("no region to look in", where="rois", remedy="name one, or leave them out")
         if not (_is_number(self.threshold_sigma) and 0 < self.threshold_sigma < math.inf):
@@ -157,7 +160,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _is_range(pair: Any) -> bool:
-    return isinstance(pair, Sequence | np.ndarray) and len(pair) == 2 and all(map(_is_number, pair)) and 0 <= pair[0] < pair[1]
+    return isinstance(pair, Sequence | np.ndarray) and np.shape(pair) == (2,) and all(map(_is_number, pair)) and 0 <= pair[0] < pair[1]
 
 
 def _at_places(targets: Targets, places: np.ndarray) -> np.ndarray:
@@ -169,7 +172,7 @@ def _at_places(targets: Targets, places: np.ndarray) -> np.ndarray:
         away, which = cKDTree(np.column_stack([targets.x_px, targets.y_px])).query(places)
         taken = np.zeros(len(targets), bool)
         for i in np.argsort(away, kind="stable"):
-            if away[i] < targets.semi_major_px[which[i]] + NEAR_PX and not taken[which[i]]:
+            if np.isfinite(away[i]) and away[i] < targets.semi_major_px[which[i]] + NEAR_PX and not taken[which[i]]:
                 of[i], taken[which[i]] = which[i], True
     return of
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pixmetry.core.arguments import choice, number, whole_number
 from pixmetry.core.errors import InputError
 from pixmetry.locate.lines import lines
 from pixmetry.locate.template import template
@@ -76,6 +77,9 @@ class Images:
             "shape": tuple(n for n in self.names if n not in (*PLANES, *LINE_PLANES)),
             "planes": self.names,
         }
+        if not isinstance(unknowns, str) and not (isinstance(unknowns, tuple | list) and all(isinstance(n, str) for n in unknowns)):
+            allowed = "position, light, shape, planes, or names of parameters"
+            raise InputError("no unknowns", where="unknowns", value=unknowns, allowed=allowed)
         if isinstance(unknowns, str):
             unknowns = sets.get(unknowns.strip()) or tuple(part.strip() for part in unknowns.split(",") if part.strip())
         unknown = [n for n in unknowns if n not in self.names]
@@ -121,12 +125,11 @@ def draw_images(
     InputError
         If a value cannot be used.
     """
-    if kind not in KINDS:
-        raise InputError("no such kind of target", where="kind", value=kind, allowed=", ".join(KINDS))
-    if not (0 <= aperture_px <= 1):
-        raise InputError("the pixel's aperture cannot be used", where="aperture_px", value=aperture_px, allowed="0 to 1")
-    if not 1 <= phases <= 50:
-        raise InputError("the number of phases cannot be used", where="phases", value=phases, allowed="1 to 50")
+    choice(kind, KINDS, "kind", "no such kind of target")
+    choice(light_on, ("surface", "image"), "light_on", "light cannot act there")
+    aperture_px = number(aperture_px, "aperture_px", "the pixel's aperture cannot be used", least=0, most=1, allowed="0 to 1")
+    phases = whole_number(phases, "phases", "the number of phases cannot be used", least=1, most=50, allowed="1 to 50")
+    parameters = _numbers(parameters)
     lattice = (np.arange(phases) + 0.5) / phases - 0.5
     places = np.stack([v.ravel() for v in np.meshgrid(lattice, lattice)], axis=1)
     if kind in ("line", "edge"):
@@ -188,11 +191,24 @@ def _line_images(kind: str, parameters: Mapping[str, float], aperture: float, wi
 
 def _side(outer: float, blur: float, aperture: float, window: int | None) -> int:
     reach = outer + REACH * np.hypot(blur, aperture / np.sqrt(12)) + 2
-    side = 2 * int(np.ceil(reach)) + 1 if window is None else int(window)
+    if window is not None:
+        allowed = f"an odd number of pixels from 3 to {LARGEST_WINDOW_PX}"
+        window = whole_number(window, "window_px", "the window cannot be used", least=3, most=LARGEST_WINDOW_PX, allowed=allowed)
+    elif not reach < LARGEST_WINDOW_PX:
+        raise InputError("the target is too large", where="parameters", value=float(outer), allowed=f"windows to {LARGEST_WINDOW_PX} px")
+    side = 2 * int(np.ceil(reach)) + 1 if window is None else window
     if side % 2 == 0 or not 3 <= side <= LARGEST_WINDOW_PX:
         what = "the window cannot be used" if window is not None else "the target is too large"
         raise InputError(what, where="window_px", value=side, allowed=f"an odd number of pixels from 3 to {LARGEST_WINDOW_PX}")
     return side
+
+
+def _numbers(parameters: Mapping[str, float]) -> dict[str, float]:
+    """The parameters of a target as numbers by name."""
+    if not isinstance(parameters, Mapping) or not all(isinstance(name, str) for name in parameters):
+        allowed = 'names and numbers, such as {"radius_px": 3.5, "blur_px": 0.7, "amplitude_dn": 150.0}'
+        raise InputError("no parameters of a target", where="parameters", value=parameters, allowed=allowed)
+    return {n: number(v, "parameters", f"{n} cannot be used", allowed="a finite number") for n, v in parameters.items()}
 
 
 def _checked(kind: str, parameters: Mapping[str, float], own: tuple[str, ...], planes: tuple[str, ...]) -> dict[str, float]:

@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from pixmetry.camera.camera import Camera
+from pixmetry.core.arguments import choice, number
 from pixmetry.core.errors import InputError, MeasureError
-from pixmetry.core.threads import thread_count
+from pixmetry.core.threads import checked_threads, thread_count
 from pixmetry.locate.centroids import _moment_kernels as m
 from pixmetry.locate.detect.limits import Limits
 from pixmetry.locate.detect.targets import Flag, Positions, Targets
@@ -146,13 +147,12 @@ class Tracker:
         from pixmetry.locate.detect.background import scale_of
         from pixmetry.locate.detect.detection import THRESHOLD_SIGMA
 
-        if kind not in SPOTS:
-            raise InputError("targets of this kind cannot be tracked", where="kind", value=kind, allowed=", ".join(SPOTS))
-        known = estimators(kind)
-        if estimator not in known:
-            raise InputError(f"no such estimator for kind {kind}", value=estimator, allowed=", ".join(known))
-        if search_px is not None and not search_px > 0:
-            raise InputError("nothing is found without a search", where="search_px", value=search_px, allowed="above 0 px")
+        choice(kind, SPOTS, "kind", "targets of this kind cannot be tracked")
+        choice(estimator, estimators(kind), "estimator", f"no such estimator for kind {kind}")
+        choice(polarity, ("auto", "bright", "dark"), "polarity", "no such polarity")
+        if search_px is not None:
+            search_px = number(search_px, "search_px", "nothing is found without a search", above=0, allowed="above 0 px")
+        time, threads = _checked_time(time), checked_threads(threads)
         image = checked_frame(first, "first frame")
         given = noise_model(noise)
         low, high = scale_ends(image, bits, given)
@@ -190,9 +190,9 @@ class Tracker:
         Raises
         ------
         InputError
-            If the frame is no grey image of the first one's size.
+            If the frame is no grey image of the first one's size, or the time no number.
         """
-        image = self._checked(frame)
+        image, time = self._checked(frame), _checked_time(time)
         self._look(image)
         return self._measure(image, time)
 
@@ -204,6 +204,8 @@ class Tracker:
         InputError
             As of `update`, when the frame's turn comes.
         """
+        if not isinstance(frames, Iterable) or (isinstance(frames, np.ndarray) and not frames.ndim):
+            raise InputError("no frames to follow", where="frames", value=frames, allowed="arrays, one after the other")
         for frame in frames:
             yield self.update(frame)
 
@@ -389,6 +391,10 @@ class Tracker:
             sigma_dn=np.sqrt(self.noise.variance_dn2(level)), row_first=row_first, row_stop=row_stop, col_first=col_first,
             col_stop=col_stop, flags=r[:, 14].astype(np.uint32),
         )  # fmt: skip
+
+
+def _checked_time(time: float | None) -> float | None:
+    return None if time is None else number(time, "time", "no time", allowed="a finite number")
 
 
 def shared_noise(plain: Positions, wider: Positions) -> np.ndarray:
