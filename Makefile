@@ -2,6 +2,7 @@
 PYTHON ?= python3
 JOBS ?= 2
 RUNS ?= 200
+SECONDS ?= 600
 FILES ?=
 ONLY ?=
 REPORT ?= pixmetry-report
@@ -16,7 +17,7 @@ PYTEST := OPENBLAS_NUM_THREADS=1 $(PY) -m pytest -n $(JOBS) --dist loadfile --hy
 QUICK := $(PYTEST) -m "not browser and not oracle" --durations=15 --durations-min=5
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test flaky oracles study bench mutants handbook handbook-check docs lint browser-test
+.PHONY: help install demo test flaky oracles study bench mutants fuzz handbook handbook-check docs lint browser-test
 
 help: ## show this list
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1|\2/p' $(MAKEFILE_LIST) | while IFS='|' read -r target text; do printf '%-20s %s\n' "$$target" "$$text"; done
@@ -44,6 +45,9 @@ bench: $(INSTALLED)-test ## run the benchmarks
 
 mutants: $(INSTALLED)-test ## plant wrong factors, one at a time, and see whether the tests find them
 	@$(PY) scripts/mutants.py --jobs $(JOBS)
+
+fuzz: $(INSTALLED)-all ## damage small files for SECONDS=600 and open them at every door: tracebacks, silent wrong answers, memory
+	@OPENBLAS_NUM_THREADS=1 $(PY) scripts/fuzz.py --seconds $(SECONDS)
 
 handbook: $(INSTALLED)-all ## run the handbook's experiments and write docs/handbook (ONLY="PAGE ...": run some)
 	@$(PY) scripts/make_handbook.py $(ONLY)

@@ -16,6 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from files.campaign_files import FRAMES, HEAD, put_campaign, put_frame
+from pixmetry.core import door
 from pixmetry.core.errors import InputError
 from pixmetry.files import FrameReader, images, iter_frames, load_campaign, read_frame, write_frame
 from pixmetry.files.images import picture_files
@@ -194,15 +195,16 @@ def test_black_and_saturated_frames_pass_unchanged(tmp_path: Path) -> None:
 
 def test_each_file_is_read_once_in_order_and_hashed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     campaign = load_campaign(put_campaign(tmp_path))
-    opened = []
-    read_bytes = Path.read_bytes
-    monkeypatch.setattr(Path, "read_bytes", lambda path: opened.append(path.name) or read_bytes(path))
+    opened: list[str] = []
+    open_file = door.open_file
+    for module in (door, images):
+        monkeypatch.setattr(module, "open_file", lambda path: opened.append(Path(path).name) or open_file(path))
     reader = FrameReader(campaign, threads=2)
     frames = [frame for group in campaign.groups for frame in reader.frames(group)]
     assert [int(f[1, 1]) for f in frames] == [60, 61, 400, 402]
     assert sorted(opened) == ["b_0.png", "b_1.png", "campaign.yaml", "d_0.png", "d_1.png"]
     for record in reader.hashes.records():
-        raw = read_bytes(tmp_path / record["name"])
+        raw = (tmp_path / record["name"]).read_bytes()
         assert record == {"name": record["name"], "sha256": hashlib.sha256(raw).hexdigest(), "size_bytes": len(raw)}
 
 

@@ -51,7 +51,7 @@ def refused(text: str, tmp_path: Path) -> str:
         ("", ["'parts' is missing"]),
         ("1: 2\n", ["1"]),
         ("parts: [3]", ["'parts.1' holds no keys", "exposure_s, irradiance_uw_per_cm2, gain"]),
-        ("a: &a [*a]\n", ["unknown key 'a'", "parts"]),
+        ("a: &a [*a]\n", ["an alias that contains itself"]),
         ("parts:\n  - &p {exposure_s: 1}\n  - {<<: *p, gain: x}\n", ["line 3", "parts.2.gain", "not a number"]),
     ],
 )

@@ -11,6 +11,8 @@ import numpy as np
 from pixmetry.assess.position_tables import read_positions
 from pixmetry.camera.camera import Camera
 from pixmetry.core.errors import InputError
+from pixmetry.files.formats import decode
+from pixmetry.files.images import image_bytes
 
 MOST_ORDER = 6  # of the polynomials of a height map
 MOST_LEVERAGE = 4.0  # at any place of the frame: there the variance of the surface over that of one height
@@ -160,15 +162,7 @@ def _heights(path: Path, frame_shape: tuple[int, int]) -> tuple[np.ndarray, np.n
 
 
 def _array(path: Path) -> np.ndarray:
-    try:
-        if path.suffix.lower() == ".npy":
-            height = np.load(path, allow_pickle=False)
-        else:
-            from tifffile import imread
-
-            height = imread(path)
-    except Exception as problem:  # a damaged file raises one of many
-        raise InputError("a height map that cannot be read", where=str(path), value=str(problem), remedy="check the file") from None
+    height = decode(image_bytes(path), path).array
     if height.ndim != 2 or height.dtype.kind not in "fiu":
         raise InputError("no height map", where=str(path), value=f"{height.dtype} of shape {height.shape}", allowed="numbers, (rows, cols)")
     return np.asarray(height, float)

@@ -15,6 +15,7 @@ import numpy as np
 
 from pixmetry.calibrate.project.tables import Table, read_table
 from pixmetry.core.config import read_text
+from pixmetry.core.door import check_depth
 from pixmetry.core.errors import InputError
 from pixmetry.core.plain_text import cell, comment, name_of
 from pixmetry.files.strict_json import json_text
@@ -350,6 +351,7 @@ def _of_json(path: Path) -> Positions:
         record = json.loads(read_text(path))
     except (ValueError, RecursionError):
         raise InputError("is not JSON", where=str(path), allowed=allowed, remedy="check the file") from None
+    check_depth(record, str(path))
     rows = record if isinstance(record, list) else record.get("targets") if isinstance(record, dict) else None
     if not isinstance(rows, list) or not rows or not all(isinstance(row, dict) for row in rows):
         raise InputError("no table of positions", where=str(path), allowed=allowed, remedy="check the file")

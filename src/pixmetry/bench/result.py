@@ -13,6 +13,7 @@ import numpy as np
 
 from pixmetry.core.checksums import check_record
 from pixmetry.core.config import read_text
+from pixmetry.core.door import one_sentence, read_bytes
 from pixmetry.core.errors import InputError
 from pixmetry.files.images import read_picture
 from pixmetry.files.results import read_maps
@@ -168,11 +169,8 @@ def _pictures(tables: Sequence[TableOfResult], own: Path, named: Sequence[Path])
 
 
 def _of_json(path: Path) -> tuple[str, list[TableOfResult], list[MapOfResult | PictureOfResult]]:
-    if path.stat().st_size > BIGGEST:
-        raise InputError("the file is too large to be shown", where=str(path), allowed=f"up to {BIGGEST >> 20} MB")
-    record = parse_json(path.read_bytes(), str(path))
-    if "checksums" in record:
-        check_record(record, str(path))
+    record = parse_json(read_bytes(path, BIGGEST), str(path))
+    check_record(record, str(path))
     shown = {k: v for k, v in record.items() if k not in ("checksums", "schema")}
     return str(record.get("schema", "JSON")), [t for t in _tables_in(shown, "") if t.rows], list(_matrices_in(shown, ""))
 
@@ -277,7 +275,8 @@ def _cell(value: Any) -> Any:
 
 def _of_csv(path: Path) -> TableOfResult:
     lines = (line for line in read_text(path).splitlines() if not line.startswith("#"))
-    rows = list(csv.reader(lines))
+    with one_sentence("not a table", str(path), allowed="CSV with a heading for each column"):
+        rows = list(csv.reader(lines))
     if not rows or len(set(rows[0])) < len(rows[0]):
         raise InputError("not a table", where=str(path), remedy="name a CSV file with a heading for each column")
     wide = len(rows[0])

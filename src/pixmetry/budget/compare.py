@@ -17,6 +17,7 @@ from pixmetry.budget.answer import Answer, answer_of, rms
 from pixmetry.budget.camera_budget import SCHEMA, CameraBudget
 from pixmetry.budget.table import AT_BOUND, TYPICAL, Pair, Parts, SourceRow
 from pixmetry.core.checksums import check_record
+from pixmetry.core.door import read_bytes
 from pixmetry.core.errors import InputError
 from pixmetry.core.plain_text import ends_of_paths
 from pixmetry.files.strict_json import parse_json, plain, starts_with
@@ -201,10 +202,7 @@ def side_of(source: CameraBudget | str | Path, name: str = "") -> BudgetSide:
     if isinstance(source, CameraBudget):
         return _side(plain(source.to_record()), name or source.camera, name or source.camera)
     path = Path(source)
-    try:
-        raw = path.read_bytes()
-    except OSError as problem:
-        raise InputError("cannot be read", where=str(path), value=problem.strerror, remedy=REMEDY) from None
+    raw = read_bytes(path, remedy=REMEDY)
     record = parse_json(raw, str(path), REMEDY)
     check_record(record, str(path))
     if record.get("schema") != SCHEMA:

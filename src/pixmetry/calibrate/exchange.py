@@ -11,6 +11,7 @@ OpenCV, module calib3d, "Camera Calibration and 3D Reconstruction"; COLMAP, src/
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,6 +20,8 @@ import numpy as np
 
 from pixmetry.calibrate.bundle.model import NAMES, POWERS, CameraModel, Direction, Projection, Sensor
 from pixmetry.core.arrays import Array
+from pixmetry.core.config import read_text
+from pixmetry.core.door import MOST_SETTINGS_BYTES, one_sentence
 from pixmetry.core.errors import InputError
 from pixmetry.core.extras import import_extra
 
@@ -26,6 +29,7 @@ GRID = 33  # places along each side of the frame at which two models are compare
 EXACT_PX = 1e-9
 LEAST_SHARE = 0.5  # of the frame in which a lens must have an inverse, to be compared
 PROJECTED_PX = 5.0  # apart at most, where a model stands for one of another projection
+DEEPEST = 200  # levels and blanks before a line, of a file of OpenCV; a matrix has two or three
 STORAGES = (".yaml", ".yml", ".xml", ".json")  # endings of files of OpenCV's FileStorage
 OPENCV = ("c", "xp", "yp", "b1", "p1", "p2", "k1", "k2", "k3")  # what its five coefficients hold,
 RATIONAL = (*OPENCV, "d1", "d2", "d3")  # what eight hold, and
@@ -313,6 +317,7 @@ def read_opencv(path: str | Path, pitch_um: tuple[float, float] | None = None) -
     cv2 = import_extra("cv2")
 
     source = Path(path)
+    _check_nesting(source)
     try:
         storage = cv2.FileStorage(str(source), cv2.FILE_STORAGE_READ)
     except (cv2.error, SystemError):  # the latter is what its constructor makes of the former
@@ -326,11 +331,24 @@ def read_opencv(path: str | Path, pitch_um: tuple[float, float] | None = None) -
             raise InputError(f"{names[0]} is missing", where=str(source), allowed=" or ".join(names))
         return found[0]
 
-    matrix = np.asarray(node("camera_matrix", "cameraMatrix", "CameraMatrix", "K").mat(), float)
-    lens = np.asarray(node("distortion_coefficients", "dist_coeffs", "distCoeffs", "D").mat(), float).ravel()
-    size = int(node("image_width", "imageWidth", "width").real()), int(node("image_height", "imageHeight", "height").real())
-    fisheye = not storage.getNode("fisheye_model").empty() and bool(storage.getNode("fisheye_model").real())
+    with one_sentence("not a camera of OpenCV", str(source), allowed="a matrix, its coefficients and the size of the frame"):
+        matrix = np.asarray(node("camera_matrix", "cameraMatrix", "CameraMatrix", "K").mat(), float)
+        lens = np.asarray(node("distortion_coefficients", "dist_coeffs", "distCoeffs", "D").mat(), float).ravel()
+        size = int(node("image_width", "imageWidth", "width").real()), int(node("image_height", "imageHeight", "height").real())
+        fisheye = not storage.getNode("fisheye_model").empty() and bool(storage.getNode("fisheye_model").real())
     return model_of_opencv(matrix, lens, size, pitch_um, where=str(source), fisheye=fisheye)
+
+
+def _check_nesting(source: Path) -> None:
+    """Refuse what lies so deep in each other that OpenCV's reader, which calls itself for each level, would end the process."""
+    depth = most = 0
+    for line in read_text(source, MOST_SETTINGS_BYTES).splitlines():
+        most = max(most, len(line) - len(line.lstrip(" ")) if line.strip() else 0)
+        for mark in re.findall(r"[\[{]|[\]}]|</?[A-Za-z_]", line):
+            depth += 1 if mark in "[{" or (mark[0] == "<" and mark[1] != "/") else -1
+            most = max(most, depth)
+    if most > DEEPEST:
+        raise InputError("nested too deep", where=str(source), allowed=f"up to {DEEPEST} levels", remedy="check the file")
 
 
 def model_of_opencv(
@@ -350,6 +368,8 @@ def model_of_opencv(
     lens = np.asarray(distortion, float).ravel()
     if k.shape != (3, 3) or not np.isfinite(k).all() or not (k[0, 0] > 0 and k[1, 1] > 0):
         raise InputError("not a camera matrix", where=where, allowed="3 × 3 with positive focal lengths")
+    if k[1, 0] or (k[2] != (0, 0, 1)).any():
+        raise InputError("not a camera matrix", where=where, value=k.tolist(), allowed="0 at its second row's begin, and 0, 0, 1 below")
     if len(lens) not in (0, 4, 5, 8, 12, 14) or not np.isfinite(lens).all():
         raise InputError("not OpenCV's coefficients", where=where, value=lens.tolist(), allowed="0, 4, 5, 8, 12 or 14 numbers")
     if fisheye and len(lens) not in (0, 4):

@@ -20,6 +20,7 @@ from pixmetry.camera.signal import Clock, Kind, Signal, Windows
 from pixmetry.camera.source import run
 from pixmetry.camera.unit_maps import MeasuredUnit, check_frame, check_maps, listing, maps_file, read_unit_maps, write_unit_maps
 from pixmetry.core.checksums import check_file
+from pixmetry.core.door import check_pixels
 from pixmetry.core.errors import ChainError, InputError
 from pixmetry.core.memory import check_memory
 from pixmetry.core.number import Estimates
@@ -95,6 +96,7 @@ class Camera:
         check_chain(self.chain, self.name)
         if min(self.frame_shape) < 1:
             raise ChainError("a frame has no pixels", where=self.name, value=self.frame_shape)
+        check_pixels(self.frame_shape[1], self.frame_shape[0], self.name)
         for element in self.chain:
             check_maps(element, f"{self.name}, {element.name}")
             check_provenance(element, f"{self.name}, {element.name}")
@@ -348,6 +350,7 @@ class Camera:
             raise InputError("the mode 'frozen' needs the background scene", value=", ".join(far), remedy="give it as background=")
         streams = self.streams(0, quiet=True)
         rows, cols = self.frame_shape
+        _check_size(self.name, rows, cols, frames=3)  # of this frame: input and output of a source, and what is kept
         grid = Grid.whole([0], (rows, cols))
         signal = self.signal(background, grid, **{name: one_value(name, value) for name, value in schedule.items()})
         kept: dict[str, tuple[Signal, Signal, Any]] = {}

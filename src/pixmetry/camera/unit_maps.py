@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pixmetry.core.door import check_archive
 from pixmetry.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -83,10 +84,13 @@ def read_unit_maps(path: Path, wanted: Mapping[str, Mapping[str, str]]) -> dict[
     """
     remedy = "copy it from the folder of the original camera file, or assess the camera again"
     try:
+        check_archive(path)
         with np.load(path, allow_pickle=False) as stored:
             found = {name: {key: stored[f"{name}/{key}"] for key in maps} for name, maps in wanted.items()}
     except FileNotFoundError:
         raise InputError("the measured maps of this camera are missing", where=str(path), remedy=remedy) from None
+    except InputError:
+        raise
     except Exception as problem:  # a damaged archive raises one of many
         raise InputError("the measured maps of this camera cannot be read", where=str(path), value=str(problem), remedy=remedy) from None
     for name, maps in wanted.items():

@@ -13,6 +13,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from pixmetry.core.door import open_file, read_bytes
 from pixmetry.core.errors import InputError
 
 KEY = "checksums"
@@ -22,7 +23,7 @@ REMEDY = "copy or make the result again; if you changed it on purpose, save it u
 
 def file_sha256(path: str | Path) -> str:
     """The SHA-256 of a file, in hexadecimal digits."""
-    with open(path, "rb") as stream:
+    with open_file(path) as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
@@ -95,9 +96,9 @@ def _digests_beside(path: Path) -> dict[str, str]:
     for name in RECORDS:
         beside = path.with_name(name)
         try:
-            record = json.loads(beside.read_bytes())
+            record = json.loads(read_bytes(beside))
             ours = str(record["schema"]).startswith("pixmetry/") and KEY in record and beside != path
-        except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        except (ValueError, KeyError, TypeError, RecursionError):
             continue  # not there, or somebody else's
         if ours and path.name in (digests := check_record(record, str(beside))):
             return digests

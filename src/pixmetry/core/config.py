@@ -14,6 +14,7 @@ from typing import Any, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
+from pixmetry.core.door import MOST_DEPTH, MOST_NODES, MOST_SETTINGS_BYTES, MOST_TEXT_BYTES, one_sentence, read_bytes
 from pixmetry.core.errors import InputError
 
 _UNIT = re.compile(r"_(?:[pnumk]?(?:m|s|hz|w|v)|mhz|ghz|c|k|f|e|dn|dn2|px|db|deg|rad|percent|bit|bits)(?:_per_[a-z0-9]+)*$")
@@ -40,18 +41,15 @@ class Settings(dict[str, Any]):
     lines: dict[tuple[str | int, ...], int]
 
 
-def read_text(path: str | Path) -> str:
+def read_text(path: str | Path, most_bytes: int = MOST_TEXT_BYTES) -> str:
     """Read a text file as UTF-8 (or UTF-16 if it says so by its mark); a byte-order mark is dropped.
 
     Raises
     ------
     InputError
-        If the file cannot be opened or is not text.
+        If the file cannot be opened, is not text, or has more bytes than ``most_bytes``.
     """
-    try:
-        raw = Path(path).read_bytes()
-    except OSError as problem:
-        raise InputError("file cannot be read", where=str(path), value=problem.strerror or str(problem), remedy="check the path") from None
+    raw = read_bytes(path, most_bytes)
     encoding = "utf-16" if raw[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
     try:
         return raw.decode(encoding)
@@ -77,7 +75,7 @@ def load_yaml(path: str | Path) -> Settings:
     InputError
         If the file cannot be read, is not YAML, repeats a key, or holds something else than a mapping.
     """
-    return parse_yaml(read_text(path), path)
+    return parse_yaml(read_text(path, MOST_SETTINGS_BYTES), path)
 
 
 def parse_yaml(text: str, path: str | Path = "text") -> Settings:
@@ -89,22 +87,28 @@ def parse_yaml(text: str, path: str | Path = "text") -> Settings:
         As `load_yaml`.
     """
     from ruamel.yaml import YAML
-    from ruamel.yaml.error import MarkedYAMLError, YAMLError
+    from ruamel.yaml.error import MarkedYAMLError
 
-    yaml = YAML(typ="safe", pure=True)
-    try:
-        data = yaml.load(text)
-        node = YAML(typ="safe", pure=True).compose(text)
-    except MarkedYAMLError as problem:
-        raise _syntax_error(problem, path) from None
-    except (YAMLError, ValueError) as problem:
-        raise InputError(f"not valid YAML: {str(problem).splitlines()[0]}", where=str(path), remedy="correct the file") from None
+    if len(text) > MOST_SETTINGS_BYTES:
+        raise InputError("too long for settings", where=str(path), allowed=f"up to {MOST_SETTINGS_BYTES >> 20} MiB")
+    with one_sentence("not valid YAML", str(path), remedy="correct the file"):
+        try:
+            constructor, parser = YAML(typ="safe", pure=True).get_constructor_parser(text)
+            try:
+                node = constructor.composer.get_single_node()
+                _check_nodes(node, str(path))
+                lines = dict(_lines(node, (), set()))  # before merge keys are resolved, which changes the nodes
+                data = None if node is None else constructor.construct_document(node)
+            finally:
+                parser.dispose()
+        except MarkedYAMLError as problem:
+            raise _syntax_error(problem, path) from None
     if data is not None and not isinstance(data, dict):
         raise InputError(
             "the file must hold keys with values", where=str(path), value=type(data).__name__, remedy="write `key: value` lines"
         )
     settings = Settings(data or {})
-    settings.lines = dict(_lines(node, (), set()))
+    settings.lines = lines
     return settings
 
 
@@ -117,6 +121,30 @@ def _syntax_error(problem: Any, path: str | Path) -> InputError:
     if "\t" in str(problem.problem) or "\\t" in str(problem.problem):
         return InputError("a tab is used for indentation", where=where, allowed="spaces", remedy="replace the tab by spaces")
     return InputError(f"not valid YAML: {problem.problem}", where=where, remedy="check indentation, colons and quotes near this line")
+
+
+def _check_nodes(node: Any, where: str) -> None:
+    """Refuse a tree that is too deep, contains itself, or becomes too large once each alias is what it stands for."""
+    sizes: dict[int, int] = {}  # of the nodes that are done; 0 while one is worked on
+    waiting = [(node, 1, False)] if node is not None else []
+    while waiting:
+        one, depth, done = waiting.pop()
+        items = one.value if isinstance(one.value, list) else []
+        parts = [part for item in items for part in (item if isinstance(item, tuple) else (item,))]
+        if done:
+            sizes[id(one)] = size = 1 + sum(sizes[id(part)] for part in parts)
+            if size > MOST_NODES:
+                raise InputError(
+                    "its aliases stand for too many values", where=where, allowed=f"up to {MOST_NODES}", remedy="correct the file"
+                )
+        elif depth > MOST_DEPTH:
+            raise InputError("nested too deep", where=where, allowed=f"up to {MOST_DEPTH} levels", remedy="correct the file")
+        elif id(one) not in sizes:
+            sizes[id(one)] = 0
+            waiting.append((one, depth, True))
+            waiting += [(part, depth + 1, False) for part in parts]
+        elif sizes[id(one)] == 0:
+            raise InputError("an alias that contains itself", where=where, remedy="correct the file")
 
 
 def _lines(node: Any, at: tuple[str | int, ...], seen: set[int]) -> Iterator[tuple[tuple[str | int, ...], int]]:

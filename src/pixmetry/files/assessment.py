@@ -9,6 +9,7 @@ import numpy as np
 
 from pixmetry.camera.camera import Camera, load_camera
 from pixmetry.core.checksums import check_file, check_record
+from pixmetry.core.door import check_depth, read_bytes
 from pixmetry.core.errors import InputError
 from pixmetry.files.results import read_maps
 
@@ -30,14 +31,14 @@ def load_assessment(path: str | Path) -> tuple[int, Camera, dict[str, np.ndarray
     remedy = "name the results.json of an assessment"
     if results.is_dir():
         results = results / "results.json"
+    text = read_bytes(results, remedy=remedy)
     try:
-        record = json.loads(results.read_text(encoding="utf-8"))
-    except OSError as problem:
-        raise InputError("results cannot be read", where=str(results), value=problem.strerror, remedy=remedy) from None
+        record = json.loads(text)
     except (ValueError, RecursionError):
         raise InputError("is not JSON", where=str(results), remedy=f"{remedy}; if this is one, it is damaged: assess again") from None
     if not isinstance(record, dict) or record.get("schema") != "pixmetry/results/1":
         raise InputError("is not the result of an assessment", where=str(results), remedy=remedy)
+    check_depth(record, str(results))
     digests = check_record(record, str(results))
     for name in ("camera.yaml", "maps.zarr.zip"):
         path = results.parent / name

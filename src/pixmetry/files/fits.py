@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pixmetry.core.door import check_frames
 from pixmetry.core.errors import InputError
 
 SIGNATURE = b"SIMPLE  ="
@@ -117,6 +118,7 @@ def _planes_of(header: dict[str, object], axes: list[int], bitpix: int, start: i
     scale, zero = (_number(header, name, default) for name, default in (("BSCALE", 1.0), ("BZERO", 0.0)))
     blank = _whole(header, "BLANK") if "BLANK" in header and bitpix > 0 else None
     bottom_up = str(header.get("ROWORDER", "")).upper() == "BOTTOM-UP"
+    check_frames(axes[-1] if len(axes) == 3 else 1)
     for k in range(axes[2] if len(axes) == 3 else 1):
         yield Plane(start + k * rows * cols * abs(bitpix) // 8, rows, cols, bitpix, scale, zero, blank, bottom_up)
 

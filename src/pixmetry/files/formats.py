@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import struct
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from typing import BinaryIO
 
 import numpy as np
 
+from pixmetry.core.door import check_frames, check_pixels, open_file
 from pixmetry.core.errors import InputError
 from pixmetry.core.memory import check_memory
 from pixmetry.files import bmp, fits, jpeg, tiff
@@ -24,7 +26,9 @@ from pixmetry.files.png import PALETTE, png_head
 from pixmetry.files.png import SIGNATURE as PNG
 from pixmetry.files.raw_values import RawLayout
 
+_NPY = b"\x93NUMPY"
 HEAD_BYTES = 16
+LONGEST_HEAD = 1 << 16  # that of NPY
 _TURNS = {2: "mirrored", 3: "by 180°", 4: "mirrored, by 180°", 5: "mirrored, by 90°", 6: "by 90°", 7: "mirrored, by 270°", 8: "by 270°"}
 
 Read = Callable[[int, int], bytes]
@@ -70,7 +74,7 @@ class Stored:
     @classmethod
     def on_disk(cls, path: Path, size: int) -> Stored:
         """The bytes of a file, of which only those are read that are asked for."""
-        return cls(size, partial(_read_part, path), lambda: path.open("rb"))
+        return cls(size, partial(_read_part, path), partial(open_file, path))
 
     @classmethod
     def in_memory(cls, raw: bytes) -> Stored:
@@ -141,7 +145,7 @@ def raw_file(path: Path, raw: RawLayout | None) -> bool:
 
 
 def _may_hold_several(path: Path) -> bool:
-    with _told_of(path), path.open("rb") as file:
+    with _told_of(path), open_file(path) as file:
         known = format_of(file.read(HEAD_BYTES))
     return known is not None and known.several
 
@@ -186,16 +190,19 @@ def _opened(path: Path, modified_ns: int, size: int, raw: RawLayout | None) -> F
     stored = Stored.on_disk(path, size)
     if raw is not None:
         start, length = raw.skip_bytes, raw.frame_bytes
+        check_frames(raw.frames_in(size))
         return FrameFile(raw.frames_in(size), lambda k: Decoded(raw.decode(stored.read(start + k * length, length))))
     known = format_of(stored.read(0, HEAD_BYTES))
     if known is None or not known.several:
         names = ", ".join(each.name for each in TABLE if each.several)
         raise InputError("not a file with several frames", allowed=f"{names}, or raw values with their layout")
-    return known.open(stored)
+    found = known.open(stored)
+    check_frames(found.count)
+    return found
 
 
 def _read_part(path: Path, offset: int, count: int) -> bytes:
-    with path.open("rb") as file:
+    with open_file(path) as file:
         file.seek(offset)
         return file.read(count)
 
@@ -236,6 +243,23 @@ def decode(raw: bytes, path: Path, *, lossy: bool = False) -> Decoded:
         return file.read(0)
 
 
+def check_head(head: bytes, path: Path) -> None:
+    """Refuse an image that is too large, by the beginning of its file, so that the rest need not be read; of PNG, BMP and NPY.
+
+    Raises
+    ------
+    InputError
+    """
+    with _told_of(path):
+        if head.startswith(PNG) and len(head) >= 24:
+            check_pixels(*struct.unpack_from(">II", head, 16))
+        elif head.startswith(bmp.SIGNATURE) and len(head) >= 26:
+            check_pixels(*map(abs, struct.unpack_from("<ii", head, 18)))
+        elif head.startswith(_NPY):
+            shape = _npy_head(partial(_part_of, head), None)[1]
+            check_pixels(*(shape[-1:-3:-1] if len(shape) < 4 else shape[2:0:-1]) if len(shape) > 1 else (1, 1))
+
+
 @contextmanager
 def _told_of(path: Path) -> Iterator[None]:
     """Name the file in errors; every decoder has its own exceptions, and all of them mean a damaged file here."""
@@ -259,7 +283,7 @@ def _png(raw: bytes) -> Decoded:
     import imagecodecs
 
     head = png_head(raw)
-    check_memory(head.decoded_bytes, _what(head.cols, head.rows), remedy="cut the image into parts")
+    _check_size(head.decoded_bytes, head.cols, head.rows)
     image: np.ndarray = imagecodecs.png_decode(raw)
     if image.ndim == 3 and image.shape[2] in (2, 4):
         image = tiff.opaque(image)
@@ -276,7 +300,7 @@ def _jpeg(raw: bytes) -> Decoded:
         remedy = "export the image in RGB, or as PNG"
         raise InputError(f"JPEG with {facts.components} colours", allowed="grey or colour (RGB)", remedy=remedy)
     needed = facts.rows * facts.cols * facts.components * (1 if facts.bits <= 8 else 2)
-    check_memory(needed, _what(facts.cols, facts.rows), remedy="cut the image into parts")
+    _check_size(needed, facts.cols, facts.rows)
     coder = "JPEG, without loss" if facts.lossless else "JPEG: its coder has changed noise and fine structure"
     steps = None if facts.lossless else jpeg.luminance_table(raw)
     return Decoded(imagecodecs.jpeg_decode(raw), facts.lossless, (coder, *_turned(facts.orientation)), steps)
@@ -287,8 +311,10 @@ def _turned(orientation: int) -> tuple[str, ...]:
     return () if turn is None else (f"the file asks for a rotation on display ({turn}): positions are those of the stored rows",)
 
 
-def _what(cols: int, rows: int) -> str:
-    return f"an image of {cols} x {rows} pixels"
+def _check_size(needed_bytes: int, cols: int, rows: int) -> None:
+    """Refuse an image that no sensor has, or for which there is no memory."""
+    check_pixels(cols, rows)
+    check_memory(needed_bytes, f"an image of {cols} x {rows} pixels", remedy="cut the image into parts")
 
 
 def _one(decoder: Callable[[bytes], Decoded]) -> Callable[[Stored], FrameFile]:
@@ -310,7 +336,7 @@ def _tiff_file(stored: Stored) -> FrameFile:
 
     def one(k: int) -> Decoded:
         page = tiff.with_coder(pages[k], stored.read)
-        check_memory(page.decoded_bytes, _what(page.shaped[3], page.shaped[2]), remedy="cut the image into parts")
+        _check_size(page.decoded_bytes, page.shaped[3], page.shaped[2])
         loss = ("JPEG inside a TIFF: its coder has changed noise and fine structure",) if page.lossless is False else ()
         return Decoded(page.image(stored.read), page.lossless, (*loss, *_turned(page.orientation)))
 
@@ -322,7 +348,7 @@ def _fits_file(stored: Stored) -> FrameFile:
 
     def one(k: int) -> Decoded:
         plane = planes[k]
-        check_memory(2 * plane.stored_bytes, _what(plane.cols, plane.rows), remedy="cut the image into parts")
+        _check_size(2 * plane.stored_bytes, plane.cols, plane.rows)
         return Decoded(plane.decode(stored.read(plane.offset, plane.stored_bytes)))
 
     return FrameFile(len(planes), one)
@@ -340,7 +366,7 @@ def _npy_file(stored: Stored) -> FrameFile:
     step = int(np.prod(one_shape, dtype=np.int64)) * dtype.itemsize
 
     def one(k: int) -> Decoded:
-        check_memory(2 * step, _what(one_shape[1], one_shape[0]), remedy="cut the image into parts")
+        _check_size(2 * step, one_shape[1], one_shape[0])
         if not fortran:
             return Decoded(np.frombuffer(read(start + k * step, step), dtype).reshape(one_shape))
         whole = np.frombuffer(read(start, frames * step), dtype).reshape(shape, order="F")
@@ -349,11 +375,11 @@ def _npy_file(stored: Stored) -> FrameFile:
     return FrameFile(frames, one)
 
 
-def _npy_head(read: Read, size: int) -> tuple[int, tuple[int, ...], np.dtype, bool]:
-    """Where the values begin, their shape and type, and whether columns are stored one by one."""
+def _npy_head(read: Read, size: int | None) -> tuple[int, tuple[int, ...], np.dtype, bool]:
+    """Where the values begin, their shape and type, and whether columns are stored one by one; a size of None is not compared."""
     from numpy.lib import format as npy
 
-    head = io.BytesIO(read(0, min(size, 1 << 16)))
+    head = io.BytesIO(read(0, LONGEST_HEAD))
     version = npy.read_magic(head)
     reader = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}.get(version)
     if reader is None:
@@ -362,6 +388,8 @@ def _npy_head(read: Read, size: int) -> tuple[int, tuple[int, ...], np.dtype, bo
     if dtype.hasobject:
         raise InputError("an array of objects", allowed="an array of numbers", remedy="store numbers")
     start = head.tell()
+    if size is None:
+        return start, tuple(int(n) for n in shape), dtype, fortran
     if start + int(np.prod([int(n) for n in shape], dtype=object) if shape else 1) * dtype.itemsize > size or any(n < 0 for n in shape):
         raise ValueError("values are missing")
     return start, tuple(int(n) for n in shape), dtype, fortran
@@ -372,7 +400,7 @@ TABLE = (
     Format("TIFF", tiff.MARKS, (".tif", ".tiff"), _tiff_file, several=True),
     Format("BMP", (bmp.SIGNATURE,), (".bmp",), _one(_bmp)),
     Format("FITS", (fits.SIGNATURE,), (".fits", ".fit", ".fts"), _fits_file, several=True),
-    Format("NPY", (b"\x93NUMPY",), (".npy",), _npy_file, several=True),
+    Format("NPY", (_NPY,), (".npy",), _npy_file, several=True),
     Format("JPEG", (jpeg.SIGNATURE,), (".jpg", ".jpeg"), _one(_jpeg), lossy=True),
 )
 *_MOST, _LAST = (known.name for known in TABLE if not known.lossy)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -11,10 +12,25 @@ from typing import NamedTuple
 import numpy as np
 
 from pixmetry.camera.observations import Storage
+from pixmetry.core.door import open_file
 from pixmetry.core.errors import InputError
 from pixmetry.core.memory import check_memory
 from pixmetry.core.threads import imap_tiles
-from pixmetry.files.formats import ENDINGS, FORMATS, Decoded, decode, frames_of, is_frame, raw_file, read_one, read_stacked
+from pixmetry.files.formats import (
+    ENDINGS,
+    FORMATS,
+    HEAD_BYTES,
+    LONGEST_HEAD,
+    Decoded,
+    check_head,
+    decode,
+    format_of,
+    frames_of,
+    is_frame,
+    raw_file,
+    read_one,
+    read_stacked,
+)
 from pixmetry.files.jpeg import SIGNATURE as JPEG
 from pixmetry.files.jpeg import luminance_of, luminance_table
 from pixmetry.files.png import SIGNATURE, PlainPng
@@ -75,7 +91,7 @@ def load_frame(
     if is_frame(path) or raw_file(path, raw):
         found, sha256, size = read_stacked(path if is_frame(path) else path / "0", raw)
         return LoadedFrame(_checked(_channel_of(found.array, channel), path), sha256, size, found.lossless)
-    data = _read_bytes(path)
+    data = image_bytes(path)
     sha256 = hashlib.sha256(data).hexdigest()
     if plain_png is not None and data.startswith(SIGNATURE) and (png := plain_png.decode(data)) is not None:
         return LoadedFrame(png, sha256, len(data))
@@ -125,7 +141,7 @@ def load_picture(path: Path, channel: str | None = None, raw: RawLayout | None =
     elif is_frame(path) or raw_file(path, raw):
         found = read_one(path if is_frame(path) else path / "0", raw)
     else:
-        found = decode(_read_bytes(path), path, lossy=True)
+        found = decode(image_bytes(path), path, lossy=True)
     array = found.array
     if array.ndim == 3 and array.shape[2] in (3, 4):
         if channel is None:
@@ -163,10 +179,17 @@ def picture_files(frames: Iterable[str | Path], endings: tuple[str, ...] = ENDIN
     return files
 
 
-def _read_bytes(path: Path) -> bytes:
+def image_bytes(path: Path) -> bytes:
+    """The bytes of an image file; of a file of no known format its first ones, which tell so."""
     try:
-        check_memory(path.stat().st_size, "the file", where=str(path), remedy="check that it is the right file")
-        return path.read_bytes()
+        with open_file(path) as file:
+            head = file.read(LONGEST_HEAD)
+            if format_of(head) is None:
+                return head[:HEAD_BYTES]
+            check_head(head, path)
+            size = os.fstat(file.fileno()).st_size
+            check_memory(size, "the file", where=str(path), remedy="check that it is the right file")
+            return head + file.read(size)
     except FileNotFoundError:
         raise InputError("file is missing", where=str(path), remedy="check the name") from None
     except OSError as problem:

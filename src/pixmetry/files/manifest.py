@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pixmetry.camera.covered import Covered
+from pixmetry.core.door import MOST_SETTINGS_BYTES, open_file, read_bytes
 from pixmetry.core.errors import InputError
 from pixmetry.files.emva_descriptor import decode_descriptor, is_descriptor, parse_descriptor
 from pixmetry.files.files import find_file, find_files
@@ -69,10 +70,7 @@ def load_campaign(path: str | Path | None = None) -> Campaign:
         allowed = "path of a manifest or descriptor, or Campaign"
         raise InputError("not a campaign", value=type(path).__name__, allowed=allowed, remedy=remedy)
     source = _find_source(EXAMPLE if path is None else Path(path))
-    try:
-        raw = source.read_bytes()
-    except OSError as problem:
-        raise InputError("file cannot be read", where=str(source), value=problem.strerror, remedy="check the permissions") from None
+    raw = read_bytes(source, remedy="check the permissions")
     if source.suffix.lower() not in (".yaml", ".yml") and is_descriptor(decode_descriptor(raw)):
         facts: dict[str, Any] = {"optics": OpticsFacts()}
         parts = _from_descriptor(source, raw, None, None)
@@ -133,8 +131,17 @@ def check_window(camera: CameraFacts, shape: tuple[int, int], where: str) -> Non
         raise InputError("the frames do not lie on the sensor", where=where, value=found, allowed=allowed, remedy=remedy)
 
 
+def _head(path: Path) -> bytes:
+    """The first MiB of a file, which tells what it is."""
+    try:
+        with open_file(path) as file:
+            return file.read(1 << 20)
+    except OSError as problem:
+        raise InputError("file cannot be read", where=str(path), value=problem.strerror, remedy="check the permissions") from None
+
+
 def _has_schema(path: Path, what: str) -> bool:
-    return re.search(rb"^schema:\s*['\"]?pixmetry/" + what.encode(), path.read_bytes(), re.MULTILINE) is not None
+    return re.search(rb"^schema:\s*['\"]?pixmetry/" + what.encode(), _head(path), re.MULTILINE) is not None
 
 
 def _find_source(path: Path) -> Path:
@@ -149,9 +156,9 @@ def _find_source(path: Path) -> Path:
     cameras = [p for p in manifests if _has_schema(p, "camera")]
     if len(manifests) > 1 or cameras:
         manifests = [p for p in manifests if _has_schema(p, "campaign")]
-    descriptors = [p for p in files if p.suffix.lower() == ".txt" and is_descriptor(decode_descriptor(p.read_bytes()))]
+    descriptors = [p for p in files if p.suffix.lower() == ".txt" and is_descriptor(decode_descriptor(_head(p)))]
     if len(manifests) == 1:  # a manifest may add the camera's facts to a descriptor beside it
-        text = manifests[0].read_text(encoding="utf-8", errors="replace")
+        text = read_bytes(manifests[0], MOST_SETTINGS_BYTES).decode("utf-8", errors="replace")
         descriptors = [p for p in descriptors if p.name not in text]
     found = manifests + descriptors
     if len(found) == 1:
@@ -183,7 +190,7 @@ def _from_manifest(source: Path, model: ManifestModel, lines: Mapping[tuple[str 
     if model.emva_descriptor is not None:
         where = _place(source, lines, "emva_descriptor")
         descriptor = find_file(source.parent, model.emva_descriptor, where)
-        parts = _from_descriptor(descriptor, descriptor.read_bytes(), camera, raw)
+        parts = _from_descriptor(descriptor, read_bytes(descriptor), camera, raw)
         return {**parts, "descriptor_path": descriptor, "licence": model.licence or parts["licence"]}
     groups = []
     for i, group in enumerate(model.frames):

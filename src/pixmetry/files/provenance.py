@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from pixmetry import __version__
+from pixmetry.core.door import read_bytes
 
 PROVENANCE_SCHEMA = "pixmetry/provenance/1"
 
@@ -36,7 +37,7 @@ class InputHashes:
 
     def add_file(self, path: Path) -> None:
         """Read a small file, such as a manifest, and take note of it."""
-        raw = Path(path).read_bytes()
+        raw = read_bytes(path)
         self.add(path, hashlib.sha256(raw).hexdigest(), len(raw))
 
     def _name(self, path: Path) -> str:

@@ -12,7 +12,9 @@ from typing import Any
 import numpy as np
 
 from pixmetry.core.checksums import check_record, sealed
+from pixmetry.core.door import check_archive
 from pixmetry.core.errors import InputError
+from pixmetry.core.memory import check_memory
 from pixmetry.files.output import files_in, replace_file
 from pixmetry.files.strict_json import json_text, plain
 
@@ -110,11 +112,15 @@ def read_maps(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         raise InputError("no such store of maps", where=str(path), remedy="check the name")
     store: Any = None
     try:
+        if path.suffix == ".zip":
+            check_archive(path)
         store = ZipStore(path, mode="r") if path.suffix == ".zip" else LocalStore(path, read_only=True)
         group: Any = zarr.open_group(store, mode="r", zarr_format=3)
         record: dict[str, Any] = dict(group.attrs)
         check_record(record, str(path))
         digests, attributes = dict(record["arrays"]), dict(record["attributes"])
+        needed = sum(group[name].nbytes for name in digests)
+        check_memory(needed, "the maps", where=str(path), remedy="check that it is the right file")
         arrays = {name: np.asarray(group[name][...]) for name in sorted(digests)}
         damaged = [name for name, array in arrays.items() if _digest(array) != digests[name]]
     except Exception as problem:  # the store, its zip file and every codec have their own, and all of them mean that it is damaged

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from pixmetry.core.door import check_depth
 from pixmetry.core.errors import InputError
 
 _INFINITE = {"inf": math.inf, "-inf": -math.inf}
@@ -103,6 +104,7 @@ def parse_json(raw: bytes, where: str, remedy: str = "check the file") -> dict[s
         raise InputError(f"not valid JSON: {problem.msg}", where=f"{where}, line {problem.lineno}", remedy="make the file again") from None
     except (ValueError, RecursionError):  # not UTF-8, or nested without end
         raise InputError("not valid JSON", where=where, remedy="make the file again") from None
+    check_depth(record, where)
     return record
 
 

@@ -15,6 +15,7 @@ from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
+from pixmetry.core.door import check_frames
 from pixmetry.core.errors import InputError
 from pixmetry.files.jpeg import jpeg_facts
 
@@ -130,7 +131,8 @@ def pages(file: BinaryIO, size: int) -> list[TiffPage]:
     """
     import tifffile
 
-    with _listening() as told, tifffile.TiffFile(file) as tiff:
+    with listening() as told, tifffile.TiffFile(file) as tiff:
+        check_frames(len(tiff.pages))
         every: list[Any] = list(tiff.pages)
         found = [page for page in every if not page.subfiletype & (_REDUCED | _MASK)] or every[:1]
         if not found:
@@ -154,6 +156,8 @@ def _page(page: Any, size: int) -> TiffPage:
         raise ValueError(f"values of {page.bitspersample} bits, sample format {page.sampleformat}, in {page.shaped[2:4]} pixels")
     if page.shaped[1] > 1:
         raise InputError("TIFF of a volume", allowed="images of one plane", remedy="store its planes as pages")
+    if 262 not in page.tags:  # without it a reader must guess whether white is high
+        raise ValueError("it does not say whether white is high or low (PhotometricInterpretation)")
     photometric = int(page.photometric)
     coder = int(page.compression)
     if photometric not in _READ or (photometric == 6 and coder not in _JPEG):
@@ -210,7 +214,8 @@ def _listen(record: logging.LogRecord) -> bool:
 
 
 @contextmanager
-def _listening() -> Iterator[list[tuple[int, str]]]:
+def listening() -> Iterator[list[tuple[int, str]]]:
+    """Take note of what tifffile says instead of printing it."""
     logger = logging.getLogger("tifffile")
     if _listen not in logger.filters:
         logger.addFilter(_listen)

@@ -11,10 +11,12 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from pixmetry.core.door import open_file
 from pixmetry.files import fits
 from pixmetry.files.formats import HEAD_BYTES, is_frame
 from pixmetry.files.jpeg import SIGNATURE as JPEG
 from pixmetry.files.png import SIGNATURE as PNG
+from pixmetry.files.tiff import listening
 
 EXIF, EXPOSURE, TAKEN, PART, MAKER, MODEL, TEXT = 0x8769, 0x829A, 0x9003, 0x9291, 0x010F, 0x0110, 0x010E  # numbers of tags (Exif 2.32)
 SCALES = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "msec": 1e-3, "us": 1e-6, "usec": 1e-6, "µs": 1e-6, "μs": 1e-6}
@@ -79,7 +81,7 @@ def told_by_file(path: Path) -> Told:
     """What the tags of a file tell; damaged tags tell nothing."""
     path = path.parent if is_frame(path) else path
     with suppress(Exception):  # what is behind a tag may be anything; the pixels are read by another way
-        with path.open("rb") as file:
+        with open_file(path) as file:
             head = file.read(HEAD_BYTES)
         if head.startswith((PNG, JPEG)):
             return _by_pillow(path)
@@ -107,7 +109,7 @@ def _by_pillow(path: Path) -> Told:
 def _by_tifffile(path: Path) -> Told:
     import tifffile
 
-    with tifffile.TiffFile(path) as file:
+    with listening(), tifffile.TiffFile(path) as file:
         page: Any = file.pages[0]
         tags = {tag.code: tag.value for tag in page.tags}
         more = tags.get(EXIF)

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from pixmetry.core.door import check_frames, check_pixels, one_sentence
 from pixmetry.core.errors import InputError
+from pixmetry.core.memory import check_memory
 
 ARRAY = "frames"
 LOSSLESS = {"bytes", "transpose", "blosc", "zstd", "gzip", "crc32c", "sharding_indexed"}
@@ -68,13 +71,17 @@ def _frames(store: Path, modified_ns: int) -> Any:
     import zarr
     from zarr.storage import LocalStore
 
-    try:
+    with one_sentence("not a store of frames", str(store), remedy="copy or make the store again"):
         frames = zarr.open_array(LocalStore(store, read_only=True), path=ARRAY, mode="r", zarr_format=3)
         complete = frames.nchunks_initialized == frames.nchunks
-    except (ValueError, KeyError, TypeError) as problem:
-        raise InputError(f"not a store of frames ({problem})", where=str(store), remedy="copy or make the store again") from None
     if frames.ndim != 3:
         raise InputError("the array of frames has wrong axes", where=str(store), value=frames.shape, allowed="frame, row, column")
+    check_frames(frames.shape[0], str(store))
+    check_pixels(frames.shape[2], frames.shape[1], str(store))
+    needed = 2 * math.prod(frames.shards or frames.chunks) * frames.dtype.itemsize
+    check_memory(
+        needed, f"a chunk of {frames.chunks} values", where=str(store), remedy="check the store, or make it again with chunks of one frame"
+    )
     if not complete:
         raise InputError("frames are missing in the store", where=str(store), remedy="copy or make the store again, empty chunks included")
     return frames

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from pixmetry.camera.camera import Camera
+from pixmetry.core.config import read_text
 from pixmetry.core.errors import InputError
 from pixmetry.core.progress import Progress, no_progress
 from pixmetry.core.threads import imap_tiles
@@ -121,12 +122,11 @@ def read_places(path: Path) -> np.ndarray:
         If there is no such file, or no such columns of numbers in it.
     """
     try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
+        rows = list(csv.DictReader(line for line in read_text(path).splitlines() if not line.startswith("#")))
         return np.array([(float(row["x_px"]), float(row["y_px"])) for row in rows]).reshape(-1, 2)
-    except OSError as problem:
-        raise InputError("file cannot be read", where=str(path), value=problem.strerror, remedy="check the name") from None
-    except (KeyError, TypeError, ValueError) as problem:
+    except InputError:
+        raise
+    except (KeyError, TypeError, ValueError, csv.Error) as problem:
         allowed = "columns x_px and y_px, a number in each row"
         raise InputError("not a table of places", where=str(path), value=str(problem), allowed=allowed) from None
 

@@ -13,6 +13,7 @@ import numpy as np
 from pixmetry.camera.motion_series import MotionSeries
 from pixmetry.camera.recordings import Recordings
 from pixmetry.core.arrays import Array
+from pixmetry.core.config import read_text
 from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.progress import Progress, no_progress
 from pixmetry.core.threads import imap_tiles, single_threaded_blas
@@ -189,12 +190,11 @@ def _holder(path: Path) -> Path:
 
 def _from_table(files: Sequence[Path], table: Path) -> list[float]:
     try:
-        with table.open(newline="", encoding="utf-8-sig") as file:
-            rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
+        rows = list(csv.DictReader(line for line in read_text(table).splitlines() if not line.startswith("#")))
         known = {name: float(row["time_s"]) for row in rows for name in (row["file"], Path(row["file"]).name)}
-    except OSError as problem:
-        raise InputError("file cannot be read", where=str(table), value=problem.strerror, remedy="check the name") from None
-    except (KeyError, ValueError, TypeError, AttributeError, UnicodeDecodeError, csv.Error):
+    except InputError:
+        raise
+    except (KeyError, ValueError, TypeError, AttributeError, csv.Error):
         raise InputError("not a table of times", where=str(table), allowed="CSV with columns file, time_s", remedy="correct it") from None
     names = names_of(files)
     missing = next((name for name in names if not np.isfinite(known.get(name, np.nan))), None)

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from pixmetry.core.door import read_bytes
 from pixmetry.core.errors import InputError
 from pixmetry.files.strict_json import plain
 from pixmetry.series.track import FrameTargets
@@ -54,7 +55,7 @@ class SeriesLog:
     def _read(self, head: Mapping[str, Any]) -> int:
         """Take over the frames of an earlier run; return how many bytes of it are whole lines."""
         remedy = "choose another output, or delete it to begin anew"
-        raw = self.path.read_bytes()
+        raw = read_bytes(self.path)
         lines = raw.splitlines(keepends=True)
         if not lines[-1].endswith(b"\n"):
             lines = lines[:-1]
@@ -74,7 +75,7 @@ class SeriesLog:
                     found = FrameTargets.from_record(record)
                     self.done[found.name] = found
                     continue
-            except (ValueError, KeyError, TypeError):
+            except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
                 raise InputError(f"line {number + 1} is no line of a log", where=str(self.path), remedy=remedy) from None
             if not known:
                 raise InputError("not a log of a series", where=str(self.path), remedy=remedy)

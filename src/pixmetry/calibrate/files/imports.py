@@ -18,6 +18,7 @@ from pixmetry.calibrate.bundle.model import CameraModel, Sensor
 from pixmetry.calibrate.exchange import model_of_opencv
 from pixmetry.calibrate.files.photogrammetric import camera_of_halcon, cameras_of_australis, cameras_of_photomodeler
 from pixmetry.core.config import load_yaml, read_text
+from pixmetry.core.door import MOST_SETTINGS_BYTES, one_sentence
 from pixmetry.core.errors import InputError
 
 MRCAL = ("PINHOLE", "OPENCV4", "OPENCV5", "OPENCV8", "OPENCV12", "STEREOGRAPHIC")
@@ -48,8 +49,8 @@ def read_cameras(path: str | Path, size: tuple[int, int] | None = None) -> dict[
     [905.0, 905.0]
     """
     source = Path(path)
-    ending, text = source.suffix.lower(), read_text(source)
-    try:
+    ending, text = source.suffix.lower(), read_text(source, MOST_SETTINGS_BYTES)
+    with one_sentence("a camera file that cannot be read", str(source), remedy="write it again"):
         if ending == ".cameramodel":
             return {source.stem: _of_mrcal(ast.literal_eval(_without_remarks(text)), str(source))}
         if ending == ".xml" and "<calibration>" in text and "opencv_storage" not in text:
@@ -62,10 +63,6 @@ def read_cameras(path: str | Path, size: tuple[int, int] | None = None) -> dict[
             return cameras_of_photomodeler(text, str(source), size)
         if ending in (".yaml", ".yml") and not text.lstrip().startswith("%YAML") and any(key in text for key in KEYS):
             return _of_yaml(load_yaml(source), str(source))
-    except (KeyError, ValueError, TypeError, SyntaxError, IndexError, ElementTree.ParseError) as problem:
-        if isinstance(problem, InputError):
-            raise
-        raise InputError(f"a camera file that cannot be read ({problem})", where=str(source), remedy="write it again") from None
     return None
 
 

@@ -18,14 +18,17 @@ from pixmetry.calibrate.lines.plumb_line import LineCalibration
 from pixmetry.calibrate.records import Calibration, ResidualGrid, Tests, read_record, record_of
 from pixmetry.core.checksums import check_record, sealed
 from pixmetry.core.config import read_text
+from pixmetry.core.door import check_depth, inflated, one_sentence
 from pixmetry.core.errors import InputError
 from pixmetry.core.finding import Finding
+from pixmetry.core.memory import check_memory
 from pixmetry.files.strict_json import json_text, plain
 
 RESULT_SCHEMA = "pixmetry/calibration-result/1"
 LINES_SCHEMA = "pixmetry/line-calibration-result/1"
 PIXELS = "pixel (0, 0) is the centre of the top-left pixel, x to the right, y down"
 LOWER = "lower triangle by rows: XX, YX, YY, ZX, ZY, ZZ"
+MOST_UNKNOWNS = 1_000_000  # of a stored covariance
 T = TypeVar("T")
 
 
@@ -208,7 +211,10 @@ def packed(matrix: np.ndarray) -> dict[str, Any]:
 def unpacked(record: Mapping[str, Any]) -> np.ndarray:
     """The matrix that `packed` stored."""
     n = int(record["size"])
-    lower = np.frombuffer(zlib.decompress(base64.b64decode(record["data"])), "<f8")
+    if not 0 <= n <= MOST_UNKNOWNS:
+        raise ValueError(f"a covariance of {n} unknowns")
+    check_memory(16 * n * n, f"a covariance of {n} unknowns", remedy="check the file")
+    lower = np.frombuffer(inflated(base64.b64decode(record["data"]), 4 * n * (n + 1)), "<f8")
     matrix = np.zeros((n, n))
     matrix[np.tril_indices(n)] = lower
     return matrix + np.tril(matrix, -1).T
@@ -267,7 +273,7 @@ def _read(path: str | Path, schemas: tuple[str, ...], made: Callable[[Mapping[st
     try:
         record = json.loads(text)
         schema = record["schema"]
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, RecursionError):
         schema = None
     if schema not in schemas:
         remedy = "name the calibration.json that `pixmetry calibrate` wrote, or its folder"
@@ -276,12 +282,10 @@ def _read(path: str | Path, schemas: tuple[str, ...], made: Callable[[Mapping[st
                 "straight lines do not determine the whole camera: calibrate with a test field (its project can `start_from` this file)"
             )
         raise InputError("not a calibration", where=str(file), value=schema, allowed=" or ".join(schemas), remedy=remedy)
+    check_depth(record, str(file))
     check_record(record, str(file))
-    try:
+    with one_sentence("a damaged calibration", str(file), remedy="calibrate again"):
         return made(record)
-    except (KeyError, TypeError, ValueError, zlib.error) as problem:
-        what = f"a damaged calibration ({problem})"
-        raise InputError(what, where=str(file), remedy="calibrate again") from None
 
 
 def _stored(record: Mapping[str, Any]) -> StoredCalibration:

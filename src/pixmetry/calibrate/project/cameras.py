@@ -265,7 +265,7 @@ def read_start(path: Path, name: str, size: tuple[int, int] | None = None) -> Ca
 def _is_ours(path: Path) -> bool:
     try:
         return str(json.loads(read_text(path)).get("schema", "")).startswith("pixmetry/")
-    except (ValueError, AttributeError):
+    except (ValueError, AttributeError, RecursionError):
         return False
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from pixmetry.core import door
 from pixmetry.core.checksums import sealed
 from pixmetry.core.errors import InputError
 from pixmetry.core.number import LOWER_LIMIT, UPPER_LIMIT, VALUE, Number
@@ -32,13 +33,7 @@ def read_bytes(path: str | Path) -> bytes:
     InputError
         If it cannot be read, is empty, or larger than any data sheet.
     """
-    try:
-        with open(path, "rb") as stream:
-            raw = stream.read(LARGEST_BYTES + 1)
-    except OSError as problem:
-        raise InputError("file cannot be read", where=str(path), value=problem.strerror or str(problem), remedy="check the path") from None
-    if len(raw) > LARGEST_BYTES:
-        raise InputError("too large for a data sheet", where=str(path), allowed=f"up to {LARGEST_BYTES >> 20} MiB", remedy="check the file")
+    raw = door.read_bytes(path, LARGEST_BYTES)
     if not raw.strip(b"\x00 \t\r\n\xef\xbb\xbf\xff\xfe"):
         raise InputError("the file is empty", where=str(path), remedy="make the data sheet again")
     return raw
