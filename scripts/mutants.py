@@ -148,7 +148,7 @@ FAULTS = (
         f"{SENSOR}infrared_and_microlens.py",
     ),
     # electronics, cable, grabber, storage
-    Fault("toe of BT.709", "alpha * gamma * TOE ** (gamma - 1)", "alpha * gamma * TOE**gamma", f"{ELECTRONICS}gamma.py"),
+    Fault("toe of BT.709", "alpha * gamma * beta ** (gamma - 1)", "alpha * gamma * beta**gamma", f"{ELECTRONICS}gamma.py"),
     Fault(
         "second term of the nonlinearity's slope",
         "(2 * params.a1 + w * (3 * params.a2",
@@ -580,8 +580,8 @@ FAULTS = (
     ),
     Fault(
         "covariance of a fit without its weights",
-        "spread = np.linalg.inv(a.T @ weight.T @ weight @ a)",
-        "spread = 4 * np.linalg.inv(a.T @ weight.T @ weight @ a)",
+        "spread = np.linalg.inv(a.T @ weighed)",
+        "spread = 4 * np.linalg.inv(a.T @ weighed)",
         "tests/assess/test_corrected.py",
     ),
     Fault("estimates of what changed stay", "names if name not in changed", "names if name in changed", "tests/camera/test_provenance.py"),
@@ -594,8 +594,8 @@ FAULTS = (
     ),
     Fault(
         "u of targets that scatter not enlarged",
-        "* max(1.0, motion.location_factor) ** 2\n    least",
-        "\n    least",
+        "* max(1.0, motion.location_factor) ** 2\n    if not np.ptp",
+        "\n    if not np.ptp",
         "tests/series/test_warm_up.py",
     ),
     Fault(
