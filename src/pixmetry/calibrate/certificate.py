@@ -32,6 +32,7 @@ from pixmetry.core.errors import InputError, MeasureError
 
 Evaluated = Literal["measured", "ideal"]
 NUMBERS = ("c", "x0", "y0", "A1", "A2", "A3", "R0", "B1", "B2", "C1", "C2")
+LARGEST = 1e6  # of any number in mm
 CLEAR, LEAST = 14.0, 1.02  # logarithm of the likelihoods' ratio, and ratio of the scatter, that tell the readings apart
 
 
@@ -56,7 +57,7 @@ def models_of_certificate(numbers: Mapping[str, float], sensor: Sensor, *, y_up:
     Raises
     ------
     InputError
-        If a name is unknown, c is missing, or the sensor has no pitch.
+        If a name is unknown, a value is no finite number, c is missing, or the sensor has no pitch.
 
     Examples
     --------
@@ -64,13 +65,19 @@ def models_of_certificate(numbers: Mapping[str, float], sensor: Sensor, *, y_up:
     >>> {where: (model.direction, round(model["c"], 3)) for where, model in models.items()}
     {'measured': ('image_to_object', 28.832), 'ideal': ('object_to_image', 28.828)}
     """
+    if not isinstance(numbers, Mapping):
+        raise InputError(
+            "not the numbers of a certificate", where="numbers", value=type(numbers).__name__, allowed="names with their values"
+        )
+    if not isinstance(sensor, Sensor):
+        raise InputError("not a sensor", where="sensor", value=type(sensor).__name__, allowed="Sensor(cols, rows, pitch_x_um, pitch_y_um)")
     unknown = next((name for name in numbers if name not in NUMBERS), None)
     if unknown is not None or not numbers.get("c"):
         what = "the principal distance is missing" if unknown is None else "not a number of such a certificate"
         raise InputError(what, where="certificate", value=unknown, allowed=", ".join(NUMBERS))
     if sensor.pitch_x_um is None:
         raise InputError("a certificate in mm, but no pitch", where="certificate", remedy="give the pixel pitch of the sensor")
-    of = {name: float(numbers.get(name, 0.0)) for name in NUMBERS}
+    of = {name: _number(name, numbers.get(name, 0.0)) for name in NUMBERS}
     c, r2, turned = abs(of["c"]), of["R0"] ** 2, -1.0 if y_up else 1.0
     balance = of["A1"] * r2 + of["A2"] * r2**2 + of["A3"] * r2**3
     (mx, my), (x, y) = sensor.per_px, sensor.centre
@@ -87,6 +94,13 @@ def models_of_certificate(numbers: Mapping[str, float], sensor: Sensor, *, y_up:
         "measured": CameraModel.of(sensor, "image_to_object", (), "camera", "perspective", c=c / corrected, **place, **measured),
         "ideal": CameraModel.of(sensor, "object_to_image", (), "camera", "perspective", c=c * drawn, **place, **ideal),
     }
+
+
+def _number(name: str, value: object) -> float:
+    real = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
+    if not real or not abs(float(value)) < LARGEST:  # type: ignore[arg-type]
+        raise InputError("not a finite number", where=f"certificate, {name}", value=value, allowed=f"below {LARGEST:g}")
+    return float(value)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
@@ -127,6 +141,9 @@ def compare_readings(network: Network, numbers: Mapping[str, float], *, y_up: bo
     """
     from pixmetry.calibrate.bundle.solve import calibrate_network
 
+    if not isinstance(network, Network):
+        remedy = "take it from a project: load_project(path).network"
+        raise InputError("not a network", where="network", value=type(network).__name__, allowed="Network", remedy=remedy)
     if len(network.cameras) != 1:
         raise InputError("a certificate of one camera", where="network", value=len(network.cameras), allowed="1")
     out = []

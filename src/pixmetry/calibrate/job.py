@@ -115,6 +115,11 @@ def calibrate(
     from pixmetry.calibrate.checks.findings import misfit_findings
 
     import_extra("cv2")
+    _check_arguments(source, output, options, check_points, progress)
+    for names, allowed, where in ((free, NAMES, "free"), (per_image, PER_IMAGE_NAMES, "per_image")):
+        if names is not None:
+            _checked(names, allowed, where)
+    _options(options or {})  # before pictures are looked at
     of = _sources(source)
     if output is not None:
         check_folder(output, of, [path for path in of if isinstance(path, Path)])  # before the work, not after it
@@ -185,7 +190,7 @@ def solve_again(
     from pixmetry.calibrate.bundle.solve import calibrate_network
     from pixmetry.calibrate.checks.hold_out import subset
 
-    if calibration.given is None:
+    if not isinstance(calibration, Calibration) or calibration.given is None:
         raise InputError("the calibration does not hold what it was made from", remedy="calibrate the project again")
     network, state = _changed(calibration.given, free, per_image), calibration.adjustment.state
     unknown = next((name for name in without if name not in network.images), None)
@@ -201,6 +206,20 @@ def solve_again(
     step("")
     about = {**calibration.provenance, "options": {field.name: getattr(chosen, field.name) for field in fields(chosen)}}
     return replace(found, provenance=about)
+
+
+def _check_arguments(source: object, output: object, options: object, check_points: object, progress: object) -> None:
+    """Refuse arguments of a wrong type."""
+    many = isinstance(source, Sequence) and not isinstance(source, (str, bytes)) and all(isinstance(one, str | Path) for one in source)
+    for where, value, fits, allowed in (
+        ("source", source, many or isinstance(source, (str, Path, Network)), "a path, a sequence of paths, or a Network"),
+        ("output", output, output is None or isinstance(output, str | Path), "a path"),
+        ("options", options, options is None or isinstance(options, Mapping), "names with their values"),
+        ("check_points", check_points, check_points is None or isinstance(check_points, CheckPoints), "CheckPoints"),
+        ("progress", progress, progress is None or callable(progress), "a function (what, done, of)"),
+    ):
+        if not fits:
+            raise InputError("cannot be used", where=where, value=type(value).__name__, allowed=allowed)
 
 
 def _from_lines(
@@ -303,6 +322,8 @@ def _project(
     if unknown is not None:
         raise InputError(f"unknown option '{unknown}'", allowed=", ".join(keys), remedy="delete it")
     given = {name: value for name, value in pictures.items() if value is not None}
+    if isinstance(given.get("grid"), (tuple, list)):
+        given["grid"] = "x".join(str(n) for n in given["grid"])
     camera = {key: given[name] for name, key in CAMERA_KEYS.items() if name in given}
     if free is not None and not _listed(free) and ("c_mm" in camera or "c_px" in camera):
         camera["free"] = []  # where nothing is to be estimated, a single picture suffices
@@ -345,6 +366,8 @@ def _changed(network: Network, free: Sequence[str] | str | None, per_image: Sequ
 
 
 def _checked(names: Sequence[str] | str, allowed: Sequence[str], where: str) -> tuple[str, ...]:
+    if not isinstance(names, str) and not (isinstance(names, Sequence) and all(isinstance(name, str) for name in names)):
+        raise InputError("not names of parameters", where=where, value=type(names).__name__, allowed=", ".join(allowed))
     wanted = _listed(names)
     unknown = next((name for name in wanted if name not in allowed), None)
     if unknown is not None:

@@ -18,7 +18,7 @@ import numpy as np
 
 from pixmetry.calibrate.bundle.model import NAMES, CameraModel
 from pixmetry.calibrate.bundle.network import Adjustment, State
-from pixmetry.core.arrays import Array
+from pixmetry.core.arrays import Array, given_array, given_count
 from pixmetry.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from pixmetry.calibrate.records import Calibration
 
 ROTATIONS, SETTLED = 10, 1e-12  # steps of the implied rotation, and the last one, rad
+MOST_PLACES = 1000  # along a side of the frame
 RANK = 1e-6  # share of the largest singular value below which a direction counts as 0
 
 
@@ -87,7 +88,7 @@ class CalibratedCamera:
     def unpack(self, values: Sequence[float] | Array) -> CalibratedCamera:
         """The camera with other values of the estimated parameters, such as a draw from their covariance."""
         row = self.model.values.copy()
-        row[self._places] = values
+        row[self._places] = given_array(values, "values", (len(self.names),), finite=True)
         return replace(self, model=replace(self.model, values=row))
 
     @property
@@ -103,6 +104,11 @@ class CalibratedCamera:
         covariance : ndarray, shape (n, 3, 3), optional
             Of the points, in that frame.
 
+        Raises
+        ------
+        InputError
+            If an argument is no array of numbers of its shape. A point that holds NaN has no pixel.
+
         Examples
         --------
         >>> from pixmetry.calibrate.bundle.model import CameraModel, Sensor
@@ -111,7 +117,9 @@ class CalibratedCamera:
         >>> seen.px.round(6).tolist(), seen.covariance_px2[0].round(6).tolist()  # u(c) = 2 px is 0.2 px at a tenth of the distance
         ([[399.5, 239.5]], [[0.04, 0.0], [0.0, 0.0]])
         """
-        points = np.asarray(points, float)
+        points = given_array(points, "points", ("n", 3))
+        if covariance is not None:
+            covariance = given_array(covariance, "covariance", (len(points), 3, 3))
         with np.errstate(divide="ignore", invalid="ignore"):
             u, v = (np.where(points[:, 2] > 0, points[:, k] / points[:, 2], np.nan) for k in (0, 1))
         x, y, by_direction, by_interior = self.model.projected(u, v)
@@ -132,8 +140,16 @@ class CalibratedCamera:
         px : ndarray, shape (n, 2)
         covariance_px2 : ndarray, shape (n, 2, 2), optional
             Of the pixels.
+
+        Raises
+        ------
+        InputError
+            If an argument is no array of numbers of its shape. A pixel that holds NaN has no ray.
         """
-        u, v = self.model.direction_of(*np.asarray(px, float).T)
+        px = given_array(px, "px", ("n", 2))
+        if covariance_px2 is not None:
+            covariance_px2 = given_array(covariance_px2, "covariance_px2", (len(px), 2, 2))
+        u, v = self.model.direction_of(*px.T)
         _, _, by_direction, by_interior = self.model.projected(u, v)
         back = _inverse(by_direction)
         slopes = -back @ by_interior[:, :, self._places]
@@ -160,9 +176,16 @@ def calibrated_cameras(calibration: Calibration | StoredCalibration) -> dict[str
     Parameters
     ----------
     calibration : Calibration or StoredCalibration
+
+    Raises
+    ------
+    InputError
+        If it is something else.
     """
     from pixmetry.calibrate.files.record import StoredCalibration
+    from pixmetry.calibrate.records import check_calibration
 
+    check_calibration(calibration)
     if isinstance(calibration, StoredCalibration):
         told: StoredCalibration | Adjustment = calibration
         models = calibration.cameras
@@ -226,11 +249,16 @@ def difference(first: CalibratedCamera, second: CalibratedCamera, cols: int = 25
     Raises
     ------
     InputError
-        If the frames have different sizes, or the lenses have no inverse in most of the frame.
+        If one of them is something else, the frames have different sizes, or the lenses have no inverse in most of the frame.
     """
     from scipy import stats
     from scipy.spatial.transform import Rotation
 
+    for name, camera in (("first", first), ("second", second)):
+        if not isinstance(camera, CalibratedCamera):
+            remedy = "take the camera out of a calibration: calibrated_cameras(calibration)[NAME]"
+            raise InputError("not a calibrated camera", where=name, value=type(camera).__name__, allowed="CalibratedCamera", remedy=remedy)
+    cols, rows = given_count(cols, "cols", 2, MOST_PLACES), given_count(rows, "rows", 2, MOST_PLACES)
     sensor, other = first.model.sensor, second.model.sensor
     if (sensor.cols, sensor.rows) != (other.cols, other.rows):
         found, allowed = f"{other.cols} x {other.rows} pixels", f"{sensor.cols} x {sensor.rows} pixels"

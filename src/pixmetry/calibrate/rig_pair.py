@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pixmetry.calibrate.bundle.model import CameraModel
+from pixmetry.core.arrays import given_array
 from pixmetry.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -54,7 +55,9 @@ class CameraPair:
         first_px, second_px : ndarray, shape (n, 2)
             Image coordinates of the same points.
         """
-        x, y = (np.column_stack([*model.direction_of(*np.asarray(px, float).T), np.ones(len(px))])
+        first_px = given_array(first_px, "first_px", ("n", 2))
+        second_px = given_array(second_px, "second_px", (len(first_px), 2))
+        x, y = (np.column_stack([*model.direction_of(*px.T), np.ones(len(px))])
                 for model, px in ((self.first, first_px), (self.second, second_px)))  # fmt: skip
         line = x @ self.essential.T
         distance: np.ndarray = np.einsum("ni,ni->n", y, line) / np.hypot(line[:, 0], line[:, 1]) * np.mean(self.second.c_px)
@@ -177,7 +180,12 @@ def camera_pair(calibration: Calibration | StoredCalibration, first: str | None 
     ``pair = camera_pair(pixmetry.read_calibration("result"))``, then ``cv2.remap(picture, *pair.rectified().maps(), cv2.INTER_LINEAR)``.
     """
     from pixmetry.calibrate.files.record import StoredCalibration
+    from pixmetry.calibrate.records import check_calibration
 
+    check_calibration(calibration)
+    for where, name in (("first", first), ("second", second)):
+        if name is not None and not isinstance(name, str):
+            raise InputError("not the name of a camera", where=where, value=type(name).__name__, allowed="a name")
     rig = calibration.tests.rig
     if isinstance(calibration, StoredCalibration):
         models = {model.name: model for model in calibration.cameras}

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+
 from pixmetry.calibrate.bundle.network import PER_IMAGE_NAMES
 from pixmetry.core.errors import ParameterError
 
@@ -13,6 +15,12 @@ CHOICES = {
     "loss": ("none", "huber", "cauchy"),
     "target": ("circle", "square"),
 }
+SWITCHES = ("snoop", "variance_components", "eccentricity", "residual_grid", "a_priori", "shared_errors", "patterns")
+TYPES: tuple[tuple[str, tuple[type, ...], str], ...] = (
+    *((name, (bool, np.bool_), "true or false") for name in SWITCHES),
+    *((name, (int, np.integer), "a whole number") for name in ("folds", "max_iterations")),
+    *((name, (int, float, np.integer, np.floating), "a number") for name in ("loss_scale", "false_alarms")),
+)
 
 
 @dataclass(frozen=True)
@@ -80,6 +88,14 @@ class Options:
     max_iterations: int = 100
 
     def __post_init__(self) -> None:
+        for name, kinds, allowed in TYPES:
+            value = getattr(self, name)
+            if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds) or value != value:
+                raise ParameterError("cannot be used", where=name, value=value, allowed=allowed)
+        if self.max_iterations < 1:
+            raise ParameterError("not a number of iterations", where="max_iterations", value=self.max_iterations, allowed="1 and more")
+        if isinstance(self.per_image, str):
+            raise ParameterError("one text", where="per_image", value=self.per_image, allowed='a tuple of names, such as ("x_scale",)')
         for name, choices in CHOICES.items():
             if getattr(self, name) not in choices:
                 raise ParameterError("no such choice", where=name, value=getattr(self, name), allowed=", ".join(choices))

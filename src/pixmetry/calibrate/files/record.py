@@ -254,6 +254,8 @@ def read_calibration(path: str | Path) -> StoredCalibration:
     >>> stored.images == made.adjustment.network.images, stored.sigma0 == made.adjustment.sigma0
     (True, True)
     """
+    if not isinstance(path, str | Path):
+        raise InputError("not the name of a folder or file", where="path", value=type(path).__name__, allowed="a path")
     return _read(path, (RESULT_SCHEMA,), _stored)
 
 

@@ -364,6 +364,6 @@ def board_size(kind: str, grid: str | tuple[int, int] | None) -> tuple[int, int]
     except (TypeError, ValueError):
         cols = rows = 0
     if min(cols, rows) < 3:
-        allowed = "COLSxROWS, such as 9x6, both at least 3" + ("; or any, for a single image" if kind == "dots" else "")
+        allowed = "COLSxROWS, such as 9x6, both at least 3" + ("; or any, for one image or a plate with marks" if kind == "dots" else "")
         raise InputError("not the size of a board", where="grid", value=grid, allowed=allowed)
     return cols, rows
