@@ -182,8 +182,7 @@ def calibrated_cameras(calibration: Calibration | StoredCalibration) -> dict[str
     InputError
         If it is something else.
     """
-    from pixmetry.calibrate.files.record import StoredCalibration
-    from pixmetry.calibrate.records import check_calibration
+    from pixmetry.calibrate.files.record import StoredCalibration, check_calibration
 
     check_calibration(calibration)
     if isinstance(calibration, StoredCalibration):

@@ -1589,20 +1589,3 @@ class Calibration:
             If there is no such table, or pandas is not installed.
         """
         return data_frame(self.columns(table))
-
-
-def check_calibration(given: object, where: str = "calibration") -> None:
-    """Refuse what is not a calibration with points.
-
-    Raises
-    ------
-    InputError
-        If it is something else.
-    """
-    from pixmetry.calibrate.files.record import StoredCalibration
-
-    if not isinstance(given, (Calibration, StoredCalibration)):
-        remedy = "give what `calibrate` or `read_calibration` returned"
-        raise InputError(
-            "not a calibration", where=where, value=type(given).__name__, allowed="Calibration, StoredCalibration", remedy=remedy
-        )

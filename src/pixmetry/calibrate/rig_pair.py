@@ -179,8 +179,7 @@ def camera_pair(calibration: Calibration | StoredCalibration, first: str | None 
     --------
     ``pair = camera_pair(pixmetry.read_calibration("result"))``, then ``cv2.remap(picture, *pair.rectified().maps(), cv2.INTER_LINEAR)``.
     """
-    from pixmetry.calibrate.files.record import StoredCalibration
-    from pixmetry.calibrate.records import check_calibration
+    from pixmetry.calibrate.files.record import StoredCalibration, check_calibration
 
     check_calibration(calibration)
     for where, name in (("first", first), ("second", second)):

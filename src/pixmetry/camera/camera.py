@@ -405,9 +405,7 @@ class Camera:
                 signal, _ = run(element.source, element.params, signal.crop(needed), stream)
         return signal.crop(needs[-1])
 
-    def _run_bands(
-        self, task: _Task, grid: Grid, elements: Sequence[Link], needs: list[Windows], signal: Signal | None = None
-    ) -> Signal:
+    def _run_bands(self, task: _Task, grid: Grid, elements: Sequence[Link], needs: list[Windows], signal: Signal | None = None) -> Signal:
         """Run one large window in bands that stay in the cache, as far as the sources allow: by rows, by columns, or whole.
 
         Sources that follow each other and allow the same kind of band are run together, band by band; ``signal``, if given, is what the

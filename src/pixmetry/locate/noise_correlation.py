@@ -368,9 +368,7 @@ def _relief(positions: Positions, good: np.ndarray, noise: NoiseModel) -> np.nda
     return relief
 
 
-def _of_coder(
-    before: float, coder: Coder, noise: NoiseModel, groups: list[list[Drawn]], some: list[Drawn], fitted: bool
-) -> list[Spread]:
+def _of_coder(before: float, coder: Coder, noise: NoiseModel, groups: list[list[Drawn]], some: list[Drawn], fitted: bool) -> list[Spread]:
     """Spreads of groups of templates that went through the coder after the noise ``before``; wider where more is left than it leaves."""
     if not fitted and np.isfinite(before):
         return [_through_coder(group, noise, coder, before)[0] for group in groups]

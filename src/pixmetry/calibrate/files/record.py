@@ -259,6 +259,21 @@ def read_calibration(path: str | Path) -> StoredCalibration:
     return _read(path, (RESULT_SCHEMA,), _stored)
 
 
+def check_calibration(given: object, where: str = "calibration") -> None:
+    """Refuse what is not a calibration with points.
+
+    Raises
+    ------
+    InputError
+        If it is something else.
+    """
+    if not isinstance(given, (Calibration, StoredCalibration)):
+        remedy = "give what `calibrate` or `read_calibration` returned"
+        raise InputError(
+            "not a calibration", where=where, value=type(given).__name__, allowed="Calibration, StoredCalibration", remedy=remedy
+        )
+
+
 def stored_cameras(path: str | Path) -> tuple[CameraModel, ...]:
     """Read the cameras alone, also of a calibration from straight lines (whose c is 0 unless it was given); raises likewise."""
     return _read(path, (RESULT_SCHEMA, LINES_SCHEMA), lambda record: tuple(_camera(camera) for camera in record["cameras"]))
