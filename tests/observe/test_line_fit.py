@@ -164,6 +164,10 @@ def test_what_the_line_needs_is_asked_for(rng: np.random.Generator):
     one_sided = [m for m in search.measured if m[0].across == "x"]
     line, optics = fit_line(one_sided)
     assert not len(line) and not len(optics) and all("along x and along y" in why for why in line.reasons.values())
+    for clock_mhz, own in ((None, False), (MHZ, False), (10.0, True)):
+        assert StatedFacts(interface="analogue", pixel_clock_mhz=MHZ, sampling_clock_mhz=clock_mhz).own_clock is own
+    line, optics = fit_line(search.measured, own_clock=True)
+    assert not len(line) and not len(optics) and all("a clock of its own" in why for why in line.reasons.values())
     told = Estimates.from_rows([("cutoff_rel", 0.35, 0.001, 500.0, "1")])
     without_clock = Observations(edges=responses_of(search, optics, told), stated=StatedFacts(interface="analogue"))
     with pytest.raises(MeasureError, match="pixel_clock_mhz"):

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+SAME_CLOCK = 1e-5  # relative: a hundredth of a pixel over a thousand
+
 
 @dataclass(frozen=True)
 class StatedFacts:
@@ -36,3 +38,10 @@ class StatedFacts:
     f_number: float | None = None
     sensor_cols: int | None = None
     sensor_rows: int | None = None
+
+    @property
+    def own_clock(self) -> bool:
+        """Whether the frame grabber samples at another rate than the pixel clock."""
+        if self.sampling_clock_mhz is None or self.pixel_clock_mhz is None:
+            return False
+        return abs(self.sampling_clock_mhz / self.pixel_clock_mhz - 1) > SAME_CLOCK

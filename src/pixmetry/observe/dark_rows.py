@@ -127,7 +127,7 @@ def without_hum(patterns: PatternList | None, rows: DarkRows | None, spectra: Sp
     """The waves without what a hum leaves of itself in the first columns of their spectrum, and without 1/f noise that rises there."""
     if patterns is None or rows is None or spectra is None:
         return patterns
-    if not rows.flicker.limits and len(rows.flicker):
+    if not rows.flicker.limits:  # found, or not told as behind a filter
         column = np.minimum(np.rint(patterns.frequency_x * rows.cols).astype(int), len(spectra.frequency_h) - 1)
         power = patterns.amplitude_dn**2 * rows.rows * rows.cols / 4
         least = np.where(patterns.moving, LEAST_WAVE, LEAST_FIXED_WAVE / rows.frames)

@@ -38,7 +38,7 @@ def reduce_edges(groups: Sequence[PictureGroup], seen: Observations) -> Observat
     focus_um = [float("nan") if g.facts.focus_um is None else g.facts.focus_um for g in groups]
     search, sharp = _in_focus(whole, focus_um)
     if analogue:
-        line, optics = fit_line(search.measured)
+        line, optics = fit_line(search.measured, own_clock=seen.stated.own_clock)
         edges = responses_of(search, optics, line)
     else:
         optics = fit_edges(search.measured)

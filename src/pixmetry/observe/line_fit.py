@@ -457,14 +457,19 @@ class LineSearch:
         return max(least[0] - least[1], 0.0) / self.scale
 
 
-def fit_line(measured: Sequence[tuple[Region, Spread]]) -> tuple[Estimates, Estimates]:
+def fit_line(measured: Sequence[tuple[Region, Spread]], own_clock: bool = False) -> tuple[Estimates, Estimates]:
     """Fit the video line of an analogue camera, and lens and pixel in front of it, to slanted edges; see `line_estimates`.
 
     Parameters
     ----------
     measured : sequence of (Region, Spread)
         The edges, as `pixmetry.observe.edges.search_edges` finds them in pictures of an analogue camera.
+    own_clock : bool
+        Whether the grabber samples at another rate than the pixel clock: a sample is then no fixed sum of pixels, and no line is fitted.
     """
+    if own_clock:
+        told = "the grabber samples by a clock of its own, and what it makes of a pixel changes along the line: sample by the pixel clock"
+        return _nothing_of_the_line(told), replace(Estimates.empty(), reasons={"spread_var_px2": told})
     found = search_models(curves_of(measured, MOST_RIGHT_PX))
     if found is not None:
         return line_estimates(found)

@@ -23,6 +23,7 @@ from pixmetry.sources.sensor._readout_kernels import spill
 UNLIMITED_E = 1e9
 SIGNIFICANT = 3.3
 NEEDED = 2.0  # times by which χ² grows without a parameter that the streaks need, whatever its u
+WITHOUT = {"drained_share": 0.0, "drain_ratio": 1.0}  # what a parameter is that the streaks do not need
 LEAST_STREAKS = 6  # columns and exposures with a streak
 LEAST_WELLS = 0.5  # of charge that left a spot in a column, for a streak
 METHOD = "charge above and below overexposed spots, fitted by the spilling of their light"
@@ -108,18 +109,24 @@ def measure(observations: Observations) -> Estimates:
 
 
 def _with_bend(found: Estimates, spots: BrightSpots, bend_rel: float) -> Estimates:
-    """With what a bent response does in u: the light of far below saturation is then that of a full well so much higher or lower."""
+    """With what a bent response does in u: the light of far below saturation is then that of a full well so much higher or lower.
+
+    What is not needed with another bend may be none at all.
+    """
     if not bend_rel or spots.streaks is None:
         return found
-    other = spots if spots.clipped else replace(spots, plateau_dn=spots.plateau_dn * (1 + bend_rel))
-    light = replace(spots.streaks, light_dn=spots.streaks.light_dn * (1 + bend_rel)) if spots.clipped else spots.streaks
-    try:
-        moved = _fitted(other, light)
-    except MeasureError:
-        moved = found
     change = np.where([name in ("full_well_dn", "drain_ratio") for name in found.names], bend_rel, 0.0) * found.values
-    if moved.names == found.names:
-        own = moved.values - found.values
+    for bend in (bend_rel, -bend_rel):
+        other = spots if spots.clipped else replace(spots, plateau_dn=spots.plateau_dn * (1 + bend))
+        light = replace(spots.streaks, light_dn=spots.streaks.light_dn * (1 + bend)) if spots.clipped else spots.streaks
+        try:
+            moved = _fitted(other, light)
+        except MeasureError:
+            continue
+        there = [
+            moved[name].value if name in moved else WITHOUT.get(name, value) for name, value in zip(found.names, found.values, strict=True)
+        ]
+        own = np.array(there) - found.values
         change = np.where(np.abs(own) > np.abs(change), own, change)
     return replace(found, covariance=found.covariance + np.outer(change, change))
 
