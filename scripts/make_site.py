@@ -50,8 +50,10 @@ CONF: dict[str, Any] = {
         "header_links_before_dropdown": 8,
         "show_nav_level": 1,
         "navigation_with_keys": False,
-        "secondary_sidebar_items": ["page-toc"],
+        "secondary_sidebar_items": {"**": ["page-toc"], "handbook/*": []},  # wide tables
     },
+    "html_static_path": ["_static"],
+    "html_css_files": ["site.css"],
     "html_show_sourcelink": False,
     "html_show_search_summary": False,  # a page opened from a folder may not read the others
     "html_copy_source": False,
@@ -63,6 +65,14 @@ CONF: dict[str, Any] = {
     "numpydoc_show_class_members": False,
     "toc_object_entries": False,
 }
+STYLE = """.bd-main .bd-content .bd-article-container { max-width: 72em; }
+.bd-article table.table { font-size: 0.9em; }
+.bd-article table.table :is(td, th) { padding: 0.3rem 0.45rem; }
+@media (max-width: 600px) {
+  .bd-article table.table { font-size: 0.8em; }
+  .bd-article h1 { font-size: 1.8em; }
+}
+"""
 
 
 def stage(folder: Path) -> None:
@@ -91,6 +101,8 @@ def stage(folder: Path) -> None:
         if len(pages) > 1:
             (folder / f"{_name(title)}.md").write_text(f"# {title}\n\n{_toctree(pages, ':maxdepth: 1')}", encoding="utf-8")
     (folder / "index.md").write_text(_front(), encoding="utf-8")
+    (folder / "_static").mkdir()
+    (folder / "_static" / "site.css").write_text(STYLE, encoding="utf-8")
 
 
 def write_notebooks(folder: Path) -> None:
@@ -141,7 +153,7 @@ def _front() -> str:
     intro = text[: text.index("## Install")].replace("docs/images/", "images/")
     begin = text[text.index("## Install") : text.index("## Assess your own camera")]
     begin = re.sub(r"\]\(docs/", "](", begin)
-    return "\n".join([intro, begin, _toctree(map(_name, SECTIONS), ":hidden:")])
+    return "\n".join([intro, begin, _toctree((f"{title} <{_name(title)}>" for title in SECTIONS), ":hidden:")])
 
 
 def _name(section: str) -> str:

@@ -51,10 +51,10 @@ def run():
         places.append([found["x_px"][order], found["y_px"][order]])
     shift = np.array(places) - np.array(places[0])  # frames, axis, target
     rms, hour = np.sqrt((shift**2).mean(axis=2)).T, np.searchsorted(minutes, 60)
+    tau, error = fit["scale_tau_s"], fit["scale_error_rel"]
     values = {"targets": shift.shape[2], "samples": rms[0][hour], "pixels": rms[0][hour] * 1.41875, "y_px": np.abs(shift[hour, 1]).max(),
               "smallest": np.abs(shift[hour, 0]).min(), "largest": np.abs(shift[hour, 0]).max(), "scale": BETWEEN / LENS_MM,
               "wide_mm": WIDTH_MM * BETWEEN / LENS_MM, "high_mm": 582 * 0.0083 * BETWEEN / LENS_MM,
-              "rest": 4 * np.exp(-3600 / fit["scale_tau_s"].value), "error": 100 * fit["scale_error_rel"].value,
-              "u_error": 100 * fit["scale_error_rel"].u, "tau_min": fit["scale_tau_s"].value / 60,
-              "u_tau_min": fit["scale_tau_s"].u / 60}  # fmt: skip
+              "rest": 4 * np.exp(-3600 / tau.value), "u_rest": 14400 * np.exp(-3600 / tau.value) * tau.u / tau.value**2,
+              "error": 100 * error.value, "u_error": 100 * error.u, "tau_min": tau.value / 60, "u_tau_min": tau.u / 60}  # fmt: skip
     return values, draw(frames[0], np.array(places[0]), shift[hour], minutes, rms)

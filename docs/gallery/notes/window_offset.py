@@ -26,15 +26,16 @@ def refused(row_offset):
 def run():
     x, y = (v.ravel() for v in np.meshgrid(np.arange(80.0, 700, 120), np.arange(120.0, 480, 80)))
     scene = Discs(x, y, diameter_px=12.0, blur_px=0.8, peak_photons=60000.0)
-    found = {}
+    found, u = {}, {}
     for offset in (28, 32, 36):
         seen = locate(camera_of(offset).expose(scene, 1, **WARM_C).data[0], polarity="bright").columns
         found[offset] = np.sort(seen["y_px"])
+        u[f"u_offset_{offset}"] = np.sqrt(seen["var_y_px2"].mean() / len(y))  # as stated for each target
     truth = np.sort(y)
     offsets = [np.mean(truth - found[o]) for o in found]
     middle = camera_of(32).true_positions([375.5], [290.5], **WARM_C)  # of the sensor, in the stored image
-    values = {"offset_28": offsets[0], "offset_32": offsets[1], "offset_36": offsets[2],
-              "u_offset_32": np.std(truth - found[32]) / np.sqrt(len(y)), "refused": sum(refused(o) for o in range(28, 37)),
+    values = {**u, "offset_28": offsets[0], "offset_32": offsets[1], "offset_36": offsets[2],
+              "refused": sum(refused(o) for o in range(28, 37)),
               "best": (582 - 512) / 2, "off_x": middle[0][0] - 255.5, "off_y": middle[1][0] - 255.5, "lost_rows": 582 - 512,
               "off_x_um": (middle[0][0] - 255.5) * 8.6 * 1.41875}  # fmt: skip
     with canvas(2.6) as (figure, axes):

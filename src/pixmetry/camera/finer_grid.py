@@ -53,7 +53,7 @@ class ShiftedFrames:
     >>> quarters = [[k / 4, 0.0] for k in range(4)]
     >>> grid = ShiftedFrames(np.array(quarters), (4, 1), (48, 48))
     >>> grid.area, round(grid.unevenness, 6)
-    (Area(row0=8, col0=9, rows=32, cols=31), 1.0)
+    (Area(row0=8, col0=8, rows=32, cols=31), 1.0)
     """
 
     shifts_px: np.ndarray
