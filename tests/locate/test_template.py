@@ -187,6 +187,19 @@ def test_information_of_few_electrons() -> None:
     assert efficiency(5.0).size == 0
 
 
+@pytest.mark.parametrize("likelihood", ["least_squares", "poisson_gaussian"])
+def test_a_rough_blur_as_broad_as_the_disc_loses_none(likelihood: str, rng: np.random.Generator) -> None:
+    """Of 2.7 px, where it is 0.7, and a pixel is black, so that the sums of the grey values tell no better one: some went on to a narrow,
+    high and blurred disc, and did not come to rest."""
+    frame, x, y, targets = field(rng, "disc", 15, [3.0, 0.7, 170.0, 10.0])
+    image = np.clip(np.rint(0.5 * rng.poisson(frame / 0.5) + rng.normal(0, 0.5, frame.shape)), 0, 255).astype(np.uint8)
+    image[np.rint(y).astype(int) + 5, np.rint(x).astype(int)] = 0
+    rough = replace(targets, blur_px=np.full(len(x), 2.7))
+    found = fit_template(image, rough, NoiseModel(0.25, 0.5), "disc", likelihood=likelihood)
+    assert not (found.flags & Flag.NOT_CONVERGED).any()
+    assert np.hypot(found.x_px - x, found.y_px - y).max() < 0.2
+
+
 @pytest.mark.parametrize("kind", ["disc", "ring", "spot"])
 def test_scipy_finds_the_same(kind: str, rng: np.random.Generator) -> None:
     """`curve_fit` of the renderer's images to the same pixels, one target."""

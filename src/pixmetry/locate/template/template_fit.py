@@ -19,6 +19,7 @@ REACH = 3.5  # standard deviations of the edge, the pixel included, up to which 
 NEAR = 3.2  # the same within which a pixel is a neighbour's
 POINT_PX = 1e-3  # radius of a spot's outline
 SMALL_PX, SHARP_PX, FAR_TOO_LARGE = 2.5, 0.3, 2.0  # size, blur and χ² per degree of freedom of a second start
+BROAD = 0.5  # of its size: rough blur from which a target counts as small
 BLUR = -7  # place of the blur among the parameters
 SUSPECT_SIGMA = 3.0  # by which χ² must exceed the usual for pixels to be looked at one by one
 LONE_SIGMA = 5.0  # residual of a pixel that stands out, in standard deviations
@@ -193,11 +194,12 @@ def with_second_start(
 ) -> Fitted:
     """Fit small targets whose residuals are far too large once more, from a sharp edge, and keep the better fit.
 
-    A disc of a pixel's size can pass for a far smaller and higher one with more blur; between the two lies a ridge of χ².
+    A disc of a pixel's size, or one that was taken to be as broad as its blur, can pass for a far smaller and higher one with more blur;
+    between the two lies a ridge of χ².
     """
     if KINDS[windows.code] not in ("disc", "ellipse"):
         return result
-    small = np.sqrt(targets.semi_major_px * targets.semi_minor_px) < SMALL_PX
+    small = np.sqrt(targets.semi_major_px * targets.semi_minor_px) < np.maximum(SMALL_PX, np.nan_to_num(targets.blur_px) / BROAD)
     again = which[(small & ~(result.at_rest & (result.chi2_per_dof < FAR_TOO_LARGE)))[which]]
     if not len(again):
         return result
