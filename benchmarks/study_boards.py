@@ -2,6 +2,7 @@
 
     python benchmarks/study_boards.py [VIEWS [SEED [FIRST]]]     random views of each board, from number FIRST on
     python benchmarks/study_boards.py difficult [VIEWS [SEED]]   so many of each difficulty: cut, blurred, tilted to 70°, and so on
+    python benchmarks/study_boards.py parts [SETS [SEED [FIRST]]]   of five views of a plate larger than they are, with three hollow dots
 
 Each board is drawn through a random pinhole view: tilted up to 60°, rolled at will, blurred, cut by the frame, in uneven light, with
 bright and dark clutter over it. A number is wrong if its point lies farther than 0.3 of the pitch from where the board has it, in the
@@ -14,7 +15,7 @@ from __future__ import annotations
 import secrets
 import sys
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
@@ -49,6 +50,8 @@ class Case:
 
 
 RANDOM = Case()
+PARTS = Case(tilt=(0.0, 50.0), distance=(0.55, 0.75), shift=0.06)
+PLATE, HOLLOW = (16, 13), ((6, 5), (10, 5), (6, 8))  # of dots, larger than its views; x, y of its hollow ones
 PLAIN = {"tilt": (0.0, 35.0), "shift": 0.04, "blur": (0.5, 1.0), "light": (0.0, 0.2), "clutter": 1, "distance": (1.3, 1.6)}
 DIFFICULT = {
     "cut": Case(**(PLAIN | {"distance": (0.7, 0.95), "shift": 0.2})),  # type: ignore[arg-type]
@@ -86,10 +89,11 @@ def drawn(board: PrintedBoard) -> tuple[np.ndarray, int]:
     corners = np.column_stack([board.black[:, :2], board.black[:, :2] + board.black[:, 2:]]) - [x0, y0, x0, y0]
     for left, top, right, bottom in np.rint(corners * step).astype(int):
         ink[top:bottom, left:right] = 0
-    for cx, cy, r in (board.discs - [x0, y0, 0]) * step:
+    for cx, cy, radius in (board.discs - [x0, y0, 0]) * step:  # a negative radius: the white middle of a hollow dot
+        r, tone = abs(radius), 0 if radius > 0 else 1
         a, b = int(cx - r) - 1, int(cy - r) - 1
         v, u = np.mgrid[b : b + int(2 * r) + 4, a : a + int(2 * r) + 4]
-        ink[v, u] = np.where(np.hypot(u - cx + 0.5, v - cy + 0.5) < r, 0, ink[v, u])
+        ink[v, u] = np.where(np.hypot(u - cx + 0.5, v - cy + 0.5) < r, tone, ink[v, u])
     return ink, step
 
 
@@ -157,6 +161,33 @@ def random_views(views: int, seed: int, first: int) -> None:
         print(f"{kind:12} {views} views, {refused} refused, {used}; wrong numbers {wrong} in views {bad}", flush=True)
 
 
+def set_of_parts(board: PrintedBoard, rng: np.random.Generator) -> tuple[int, int, int]:
+    """Five views of parts of a plate: those that are used, their points, and the wrong numbers among them."""
+    homographies = [view_of(board, PARTS, rng) for _ in range(5)]
+    frames = [frame_of([(board, homography)], PARTS, rng) for homography in homographies]
+    try:
+        seen = observations_of(frames, "dots", grid=PLATE, pitch=1.0, least_images=2)
+    except MeasureError:
+        return 0, 0, 0
+    back = np.linalg.inv(homographies)[[int(name.split()[1]) - 1 for name in seen.images]][seen.image]
+    ray = np.einsum("nij,nj->ni", back, np.column_stack([seen.x_px, seen.y_px, np.ones(len(seen))]))
+    places, named = ray[:, :2] / ray[:, 2:], seen.xyz[seen.point, :2]
+    wrong = []
+    for _ in range(4):  # the plate may be counted from any corner, and from the first row and column that are seen
+        named = np.column_stack([-named[:, 1], named[:, 0]])
+        wrong.append(int((np.abs(places - named - np.median(np.rint(places - named), axis=0)).max(axis=1) > MOST_OFF).sum()))
+    return len(seen.images), len(seen), min(wrong)
+
+
+def parts(sets: int, seed: int, first: int) -> None:
+    plain = board_of("dots", PLATE, 1.0)
+    board = replace(plain, discs=np.vstack([plain.discs, [(x, y, -0.125) for x, y in HOLLOW]]))
+    found = np.array([set_of_parts(board, np.random.default_rng([seed, 2000, one])) for one in range(first, first + sets)])
+    used, points, wrong = found.sum(axis=0)
+    bad = (first + np.flatnonzero(found[:, 2])).tolist()
+    print(f"{sets} sets of 5 views: {used} views used with {points} points; wrong numbers {wrong} in sets {bad}")
+
+
 def difficult_views(views: int, seed: int) -> None:
     print("| board | " + " | ".join(DIFFICULT) + " |\n|" + "---|" * (len(DIFFICULT) + 1))
     reasons: Counter[str] = Counter()
@@ -173,14 +204,15 @@ def difficult_views(views: int, seed: int) -> None:
 
 
 if __name__ == "__main__":
-    difficult = sys.argv[1:2] == ["difficult"]
-    numbers = [int(float(text)) for text in sys.argv[1 + difficult :]]
+    mode = sys.argv[1] if sys.argv[1:2] in (["difficult"], ["parts"]) else "random"
+    numbers = [int(float(text)) for text in sys.argv[1 + (mode != "random") :]]
     seed = numbers[1] if len(numbers) > 1 else secrets.randbits(32)
-    if difficult:
-        views = numbers[0] if numbers else 20
-        print(f"difficult {views} {seed} repeats these draws")
+    first = numbers[2] if len(numbers) > 2 else 0
+    views = numbers[0] if numbers else 20 if mode == "difficult" else 30
+    print(f"{'' if mode == 'random' else mode + ' '}{views} {seed} {'' if mode == 'difficult' else first} repeats these draws")
+    if mode == "difficult":
         difficult_views(views, seed)
+    elif mode == "parts":
+        parts(views, seed, first)
     else:
-        views, first = numbers[0] if numbers else 30, numbers[2] if len(numbers) > 2 else 0
-        print(f"{views} {seed} {first} repeats these draws")
         random_views(views, seed, first)

@@ -13,6 +13,7 @@ from pixmetry.core.errors import ParameterError
 CHOICES = {
     "field": ("auto", "fixed", "free"),
     "loss": ("none", "huber", "cauchy"),
+    "control": ("tested", "as_stated"),
     "target": ("circle", "square"),
 }
 SWITCHES = ("snoop", "variance_components", "eccentricity", "residual_grid", "a_priori", "shared_errors", "patterns")
@@ -40,6 +41,10 @@ class Options:
         Look for gross errors.
     false_alarms : float
         Number of good image points that may be expected to be rejected in one adjustment, above 0.
+    control : {"tested", "as_stated"}
+        What becomes of control points (weighted ones, and a few fixed ones beside free points) and of scale bars that the network
+        contradicts. ``"tested"`` leaves them out one by one, or raises their uncertainties where these are stated too small, and says it;
+        ``"as_stated"`` keeps all of them with the uncertainties that they came with, and only says what contradicts them.
     variance_components : bool
         Estimate the standard deviations of x and of y of each camera, and weigh by them: what image coordinates scatter beyond covariances
         that they came with is added to these; smaller or guessed ones are multiplied. Without it, covariances keep their ratios; beside
@@ -76,6 +81,7 @@ class Options:
     loss_scale: float = 2.5
     snoop: bool = True
     false_alarms: float = 0.01
+    control: Literal["tested", "as_stated"] = "tested"
     variance_components: bool = True
     eccentricity: bool = True
     target: Literal["circle", "square"] = "circle"

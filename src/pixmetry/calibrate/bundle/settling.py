@@ -72,7 +72,7 @@ def settle(measured: Network, state: State, options: Options, say: Progress, bef
     before : Settled, optional
         The same image coordinates, settled already with other points: where to go on.
     """
-    from pixmetry.calibrate.checks.known_checks import lost_records, set_free, where_seen, wrong_known
+    from pixmetry.calibrate.checks.known_checks import has_known, lost_records, set_free, where_seen, wrong_known
 
     given = measured
     loss: str = options.loss if before is None else "none"
@@ -85,10 +85,14 @@ def settle(measured: Network, state: State, options: Options, say: Progress, bef
     if before is None:
         measured = _first_weights(measured, shift, state, options)
     measured, state, used, loss, faults = _checked_known(measured, shift, state, used, loss, options, say, rejected)
+    if (
+        not _tests_known(options) and has_known(measured) and not faults.untested
+    ):  # image points were tested without control, and do not go for it
+        options = replace(options, snoop=False)
     for loop in range(1, LOOPS + 1):
         say(f"adjusting, round {loop}")
         adjustment = _without_gross_errors(without_eccentricity(measured, shift), state, used, loss, options, rejected)
-        wrong = wrong_known(measured, adjustment) if options.snoop else freed[:0]
+        wrong = wrong_known(measured, adjustment) if _tests_known(options) else freed[:0]
         if len(wrong):
             state = where_seen(without_eccentricity(measured, shift), adjustment, wrong)
             measured, used, freed = set_free(measured, wrong), adjustment.used | np.isin(measured.point, wrong), np.append(freed, wrong)
@@ -105,6 +109,11 @@ def settle(measured: Network, state: State, options: Options, say: Progress, bef
     faults += KnownFaults(control_points=lost_records(given, adjustment, freed))
     faults = replace(faults, raised=raised(given, measured))
     return Settled(measured, adjustment, shift, components, faults, given_px2, rejected)
+
+
+def _tests_known(options: Options) -> bool:
+    """Whether control points and bars may be left out."""
+    return options.snoop and options.control == "tested"
 
 
 def _as_given(network: Network, options: Options) -> bool:
@@ -162,7 +171,10 @@ def _checked_known(
 
     if not (options.snoop and has_known(measured)):
         return measured, state, used, loss, KnownFaults()
-    measured, absurd = without_absurd_control(measured, state)
+    if _tests_known(options):
+        measured, absurd = without_absurd_control(measured, state)
+    else:
+        absurd = ()
     say("testing scale bars and control points")
     alone = replace(options, a_priori=False)
     networks = loosened(without_eccentricity(measured, shift), loose_coordinates(measured))
@@ -171,6 +183,8 @@ def _checked_known(
         return measured, state, used, loss, KnownFaults(control_points=absurd, untested=why)
     weighted = weighted_instead(measured, clean)
     begin, used = with_the_rest(weighted, clean, state, used, rejected)
+    if not _tests_known(options):
+        return measured, begin, used, "none", KnownFaults()
     near, begin, far = in_frame_of_control(weighted, begin)
     check = partial(check_known, without_eccentricity(near, shift), clean, adjust_with(alone), used=used, held=few_held(measured))
     tried, why = first_that_stands((begin, state), lambda start: check(state=start))

@@ -224,6 +224,7 @@ class OptionsModel(Model):
     loss_scale: Positive | None = None
     snoop: bool | None = None
     false_alarms: Annotated[float, Field(gt=0, lt=100)] | None = None
+    control: Literal["tested", "as_stated"] | None = None
     variance_components: bool | None = None
     eccentricity: bool | None = None
     folds: Literal[0] | Annotated[int, Field(ge=2)] | None = None
