@@ -193,6 +193,41 @@ def test_the_error_shown_is_that_of_the_command_line(browser: Any, link: str, tm
     page.close()
 
 
+def test_two_cameras_beside_each_other(browser: Any, link: str) -> None:
+    page = opened(browser, link, state={"camera": "imx264_like", "side_px": 64})
+    page.wait_for_selector("body[data-budget]")
+    page.click("#compare")
+    page.wait_for_selector("#better >> text=Both are alike.")
+    page.select_option("#other-camera", "dcs420_like")
+    page.focus("#other-camera")
+    page.wait_for_selector("#better >> text=is better here")
+    assert page.evaluate("() => document.activeElement.id") == "other-camera"  # it stays while the rows come in
+    mine, theirs = page.evaluate("() => [bench.budget, bench.other.budget].map((b) => b.rms_px.after)")
+    better = "imx264_like" if mine < theirs else "dcs420_like"
+    assert page.inner_text("#better").startswith(f"{better} is better here")
+    assert "make the difference" in page.inner_text("#other table")
+    page.click("#swap")
+    page.wait_for_selector("#other-title >> text=imx264_like")
+    assert page.evaluate("() => [bench.state.camera, bench.other.budget.rms_px.after]") == ["dcs420_like", mine]
+    page.click("#compare")
+    assert page.is_hidden("#other")
+    at_peace(page, link)
+    page.close()
+
+
+def test_a_scene_file_is_opened_and_left(browser: Any, link: str, tmp_path: Path) -> None:
+    scene = tmp_path / "scene.yaml"
+    scene.write_text("schema: pixmetry/scene/1\ndiscs: {lattice_px: 30, diameter_px: 9, peak_photons: 5000}\n")
+    page = opened(browser, link, state={"camera": "imx264_like", "side_px": 64})
+    page.set_input_files("#file", scene)
+    page.wait_for_selector("#of-a-file")
+    assert page.evaluate("() => bench.state.scenario.target.diameter_px") == 9
+    page.click("#of-a-file button")
+    page.wait_for_selector("#of-a-file", state="detached")
+    at_peace(page, link)
+    page.close()
+
+
 def test_nothing_sticks_out_and_everything_has_a_name(browser: Any, link: str, width: Any) -> None:
     page = opened(browser, link, *width, state={"camera": "imx264_like", "chosen": "sensor.prnu"})
     page.wait_for_selector("body[data-found]")

@@ -85,7 +85,7 @@ def test_a_table_sorts_and_filters_and_a_row_of_the_budget_leads_to_its_evidence
         page.fill("#tables details:nth-of-type(1) input[type=search]", "sensor")
         assert column(page, 1) == ["sensor.dsnu", "sensor.prnu"]
         page.click("#tables td button:text-is('sensor.prnu') >> nth=0")
-        page.wait_for_function("document.getElementById('sheet').getAttribute('aria-label').startsWith('prnu_rel')")
+        page.wait_for_selector("#sheet[aria-label^='prnu_rel']")
         shown = page.inner_text("#tables")
         assert "0.01" in shown and "pixel_std" in shown and "sensor.dsnu" not in shown  # the estimate of this source alone
         page.click("#all")
@@ -108,12 +108,12 @@ def test_residuals_lie_over_the_image_that_they_belong_to(browser: Any, tmp_path
         page.fill("#scale", "1")
         assert page.evaluate(INK)["amber"] < first["amber"]
         page.select_option("#image", "b.png")
-        page.wait_for_function("document.getElementById('sheet').getAttribute('aria-label') === 'b.png; 1 positions'")
+        page.wait_for_selector("#sheet[aria-label='b.png; 1 positions']")
         page.click("#closer")
         assert page.evaluate("() => document.getElementById('map').value") == "1"
         page.wait_for_selector("#tables tbody tr")
         page.click("#tables tbody tr:nth-child(1) button[aria-label='show on the map']")
-        page.wait_for_function("document.getElementById('sheet').getAttribute('aria-label') === 'a.png; 1 positions'")
+        page.wait_for_selector("#sheet[aria-label='a.png; 1 positions']")
         box = page.query_selector("#sheet").bounding_box()
         page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
         told = page.inner_text("#under")

@@ -92,7 +92,12 @@ NOTES = (
         "Thresholds",
         "A hard threshold lets whole grey values in and out as the target moves over the pixels, and the error changes with the place. "
         "Choose the estimators hard threshold, soft threshold and template, and compare the curves.",
-        {"camera": CAMERA, "estimator": "hard_threshold", "chosen": "processing.threshold"},
+        {
+            "camera": CAMERA,
+            "estimator": "hard_threshold",
+            "scenario": {"target": {"diameter_px": 4.0}},
+            "chosen": "processing.threshold",
+        },
         "pixel",
     ),
     Note(

@@ -132,7 +132,9 @@ def over_a_pixel(shelf: Shelf, state: BenchState, kept: KeptSteps, go_on: Callab
         for name in names:
             found = found_in(picture, replace(one, state=one.state.model_copy(update={"estimator": name})), one.true_px)
             errors[name].append(None if found.error_px is None else found.error_px[0])
-    return {"place_px": places.tolist(), "errors_px": errors}
+    found = {name: [v for v in values if v is not None] for name, values in errors.items()}
+    ranges = {name: float(np.ptp(values)) if values else None for name, values in found.items()}
+    return {"place_px": places.tolist(), "errors_px": errors, "range_px": ranges}
 
 
 def exposed_rows(layout: Layout) -> dict[str, Any]:

@@ -415,6 +415,8 @@ function showLesson(note) {
   const box = $("lesson");
   box.hidden = !note;
   $("note").value = note?.number ?? "";
+  if (note?.view) box.after($("views")); // what the note is about, without scrolling
+  else $("measured").before($("views"));
   if (note) box.replaceChildren(el("p", {}, el("b", {}, `Note ${note.number}: ${note.title}. `), note.text));
 }
 

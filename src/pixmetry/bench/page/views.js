@@ -1,5 +1,5 @@
 // The other views, each asked for when it is open.
-import { $, digits, el, svg } from "./dom.js";
+import { $, digits, el, mpx, svg } from "./dom.js";
 import { Latest } from "./ask.js";
 import { plot, screen } from "./draw.js";
 
@@ -93,6 +93,7 @@ function hour(answer) {
 function overPixel(answer) {
   const lines = Object.entries(answer.errors_px).map(([name, y]) => ({ x: answer.place_px, y, name: name.replaceAll("_", " ") }));
   fill(plot({ lines, xLabel: "place of the target in the pixel / px", yLabel: "error of x / px", label: "Error of x while the target goes over a pixel", height: 200 }),
+    el("p", { id: "ranges" }, "From the lowest error to the highest: ", Object.entries(answer.range_px).map(([name, v]) => `${name.replaceAll("_", " ")} ${v === null ? "–" : mpx(v)}`).join(", "), "."),
     el("p", { class: "hint" }, "Every temporal noise is at its mean: what is left is the same in every frame. A good estimator gives a level line."));
 }
 
