@@ -33,6 +33,7 @@ const keepLink = () => history.replaceState(null, "", `#${packed(bench.state)}`)
 function changed(redraw = false) {
   serial++;
   said("");
+  $("pictures").classList.add("settling"); // what is said of the picture is of the one before, until it is computed anew
   pictures.ask(bench.state);
   bench.stale = true;
   budgets.stop();
@@ -77,6 +78,7 @@ function showPicture(answer) {
 function showFound(answer, asked) {
   if (asked !== serial) return;
   bench.found = answer.found;
+  $("pictures").classList.remove("settling");
   if (!shown || !bench.picture) return;
   drawFound(shown.over, bench.picture, answer.found);
   shown.text.textContent = errorText(answer.found);
@@ -121,7 +123,7 @@ function chip(where, name, title, on, changedHere, row) {
   const part = share(row), size = row && (bench.before ? row.before_px : row.after_px);
   button.className = `chip${part > CALM_SHARE ? " large" : ""}${on ? "" : " off"}${changedHere ? " changed" : ""}`;
   button.setAttribute("aria-pressed", String(bench.state.chosen === name));
-  button.setAttribute("aria-label", `${title}${on ? "" : ", switched off"}${changedHere ? ", changed" : ""}${part ? `, ${digits(100 * part, 2)} % of the error` : ""}`);
+  button.setAttribute("aria-label", `${title}${on ? "" : ", switched off"}${changedHere ? ", changed" : ""}${part && !bench.stale ? `, ${digits(100 * part, 2)} % of the error` : ""}`);
   bar.style.width = `${(100 * Math.sqrt(part)).toFixed(1)}%`;
   words.textContent = title;
   number.textContent = on && size > 5e-6 ? mpx(size).replace(" mpx", "") : "";
@@ -151,7 +153,7 @@ function showChain() {
     if (!heads.has(stage.id)) heads.set(stage.id, el("li", { "data-stage": stage.id }, el("div", { class: "stage" }, el("span", {}, stage.title), el("span")), el("ul")));
     const head = heads.get(stage.id);
     head.className = items.length > 12 ? "long" : "";
-    head.querySelector(".stage").lastChild.textContent = whole >= 0.0005 ? `${digits(100 * whole, 2)} %` : "";
+    head.querySelector(".stage").lastChild.textContent = whole >= 0.0005 && !bench.stale ? `${digits(100 * whole, 2)} %` : "";
     head.style.borderTopColor = whole > 0 ? `color-mix(in srgb, var(--hot) ${Math.round(100 * Math.sqrt(whole))}%, var(--grid))` : "";
     list(head.lastChild, items);
     return head;
@@ -186,6 +188,7 @@ function showSource() {
   const stars = "★".repeat(source.stars) + "☆".repeat(5 - source.stars);
   parts.push(el("p", { class: "hint" }, el("span", { class: "stars", role: "img", "aria-label": `${source.stars} of 5 stars in the handbook` }, source.number ? stars : ""), ` ${source.number ? `row ${source.number} of the handbook's table` : "not in the handbook's table"}${source.note ? `, ${source.note}` : ""} · ${source.id}`));
   parts.push(el("p", { class: "about" }, source.description));
+  parts.push(el("p", { class: "about", id: "cost", role: "status" }));
   if (source.equation) parts.push(el("p", { class: "equation" }, source.equation));
   const row = el("div", { class: "row" });
   if (element) {
@@ -210,6 +213,7 @@ function showSource() {
   parts.push(el("p", { class: "about" }, el("b", {}, "Usual size: "), source.typical_size), el("p", { class: "about" }, el("b", {}, "What to do: "), source.advice));
   parts.push(el("details", {}, el("summary", {}, "References"), el("ul", {}, source.references.map((r) => el("li", { class: "about" }, r)))));
   body.replaceChildren(...parts);
+  showCost();
 }
 
 function set(key, value, box) {
@@ -336,7 +340,16 @@ function showNumbers() {
   if (!bench.camera) return;
   showChain();
   showBars();
+  showCost();
   showHeadline();
+}
+
+// The answer to "what does this cost me?"
+function showCost() {
+  const row = bench.rows.get(bench.state.chosen), box = $("cost");
+  if (!box) return;
+  const known = row && counted(row);
+  box.textContent = known ? `Here it moves a position by ${px(row.before_px)} before a calibration and by ${px(row.after_px)} after it (k = 1, rms of x and y).` : "";
 }
 
 function showHeadline() {
@@ -401,6 +414,9 @@ function showState() {
   bench.camera = null;
   bench.budget = null;
   bench.rows = new Map();
+  bench.found = null;
+  $("beside")?.remove();
+  if (shown) shown.text.textContent = "";
   $("headline").replaceChildren(el("p", {}, "The budget is being computed; its rows appear below as they are known."));
   changed(true);
 }
@@ -522,7 +538,7 @@ function showOther() {
     body.append(el("tr", {}, el("th", { scope: "row", colspan: 3 }, "The sources that make the difference, after calibration")));
     for (const r of apart(mine, theirs)) line(r.title, r.px, (v) => (v === null ? "–" : mpx(v)));
   }
-  const heading = el("tr", {}, ["", bench.camera?.name ?? "", o.name].map((t) => el("th", { scope: "col" }, t)));
+  const heading = el("tr", {}, ["", `above: ${bench.camera?.name ?? ""}`, `beside: ${o.name}`].map((t) => el("th", { scope: "col" }, t)));
   $("other-body").replaceChildren(el("p", { id: "better" }, el("b", {}, words)), el("div", { class: "side" }, figure, el("div", { class: "scroll" }, el("table", {}, el("caption", {}, "One target in one frame, k = 1, rms of x and y"), el("thead", {}, heading), body))));
 }
 
@@ -540,7 +556,8 @@ function apart(mine, theirs) {
 function compared(mine, theirs) {
   const [a, b] = [mine, theirs].map((x) => x.rms_px.after);
   if (Math.abs(a - b) < 0.01 * Math.max(a, b)) return "Both are alike.";
-  return `${a < b ? bench.camera.name : bench.other.name} is better here: ${px(Math.min(a, b))} against ${px(Math.max(a, b))}.`;
+  const names = bench.camera.name === bench.other.name ? ["The one above", "The one beside"] : [bench.camera.name, bench.other.name];
+  return `${names[a < b ? 0 : 1]} is better here: ${px(Math.min(a, b))} against ${px(Math.max(a, b))}.`;
 }
 
 $("camera").addEventListener("change", () => begin({ camera: $("camera").value, scene: bench.state.scene, scenario: bench.state.scenario, estimator: bench.state.estimator, chosen: bench.state.chosen }));
