@@ -147,7 +147,10 @@ def draw_unit(kind: str, number: int, seed: int) -> Unit:
     squares = int(rng.integers(2, 4))
     borders = BORDERS if ccd and not analogue else {}
     rows, cols = 2 * CELL + sum(borders.get(k, 0) for k in ("top", "bottom")), squares * CELL + 8
-    cols = int(cols * CLOCK_MHZ / 10.0) if "grabber.sampling_clock" in values else cols + sum(borders.get(k, 0) for k in ("left", "right"))
+    if "grabber.sampling_clock" in values:  # as many samples as the rows last
+        values["grabber.sampling_clock"]["samples"], cols = cols, int(np.ceil(cols * CLOCK_MHZ / 10.0))
+    else:
+        cols += sum(borders.get(k, 0) for k in ("left", "right"))
     chain = tuple(Element(s.id, s, s.parameters(**values[s.id])) for s in in_order(get_source(name) for name in values))
     known = {"interface": "analogue" if analogue else "digital", "sensor": "ccd" if ccd else "cmos", "bits": bits}
     facts = {**known, "frame_period_s": 0.04} | ({"covered": borders} if borders else {})

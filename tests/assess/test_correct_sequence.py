@@ -171,6 +171,20 @@ def test_rows_keep_no_offset_that_a_gain_or_a_mixture_has_changed(changed: dict[
     assert left < 2.5
 
 
+def test_offsets_of_rows_are_those_in_front_of_a_gamma(rng: np.random.Generator) -> None:
+    """Covered columns at 60 DN, where the curve is ten times as steep as at 700; frames made without the package. Subtracted as codes the
+    offsets of 8 DN would leave 29 DN, the noise of 24 covered columns leaves 4/√24 DN."""
+    light = np.pad(rng.uniform(600, 900, SHAPE), ((0, 0), (0, 24)), constant_values=60.0)
+    offset = 8.0 * rng.uniform(-np.sqrt(3), np.sqrt(3), (4, SHAPE[0], 1))
+    straight = light + offset + 4.0 * rng.standard_normal((4, *light.shape))
+    frames = np.rint(BLACK_DN + 4095 * (straight / 4095) ** 0.45).astype(np.uint16)
+    camera = replace(camera_with(electronics__gamma={"gamma": 0.45}), facts={"covered": {"right": 24}})
+    found = pixmetry.correct(frames, camera)
+    assert found.frames is not None
+    rows = (found.frames - light[:, : SHAPE[1]]).mean(axis=2)
+    assert (rows - rows.mean(axis=1, keepdims=True)).std() < 1.5
+
+
 def test_mixed_frames_are_those_of_the_camera_that_does_not_mix(seed: int) -> None:
     """With the same draws. Their rounding to whole DN is left, 1/√12 √(1 + 0.4²)/0.6 and that of the others: 0.6 DN of steps of 800 DN."""
     camera = camera_with(**MIXED)

@@ -56,6 +56,7 @@ LEAST_RESPONSE = 0.1  # of a pixel that is divided by it; one with less is a def
 MOST_CLIPPED = 0.01  # of the values of dark or flat frames: hot pixels
 RESCALES = ("electronics.agc", "processing.temporal_noise_reduction")  # what stored values tell of a frame is changed by these
 BY_VALUE = ("electronics.gamma", "electronics.hdr_gain", "electronics.nonlinearity")  # ask for no place
+CURVES = (*BY_VALUE, "sensor.log_response", "processing.companding")  # a value behind them is that of a value ahead
 HIDDEN_BY = {"sensor.bayer_mosaic": "processing.demosaic"}  # what is not there any more behind another source
 TOLD_BY = {
     "row_offset_dn": "the covered pixels of each frame",
@@ -470,8 +471,23 @@ class Known:
         if covered is None or stack.shape[1:] != covered.stored_shape(self.camera.output_shape):
             return {}
         sinks = any(e.source.id == "grabber.clamp" and e.params.droop_rel > 0 for e in self.camera.active)
-        found = [row_and_column_offsets(frame, covered, left_alone=sinks) for frame in stack]
+        found = [row_and_column_offsets(frame, covered, left_alone=sinks) for frame in self._straight(stack)]
         return {name: np.array([f[name] for f in found]) for name in found[0]}
+
+    def _straight(self, stack: np.ndarray) -> np.ndarray:
+        """Codes in DN as they were in front of the curves that are undone before offsets are subtracted; codes where there is none."""
+        order = _last_first(self.camera)
+        offsets = next((e for e in order if OF_FRAMES.get(e.source.id, "factor_rel") != "factor_rel"), None)
+        ahead = [] if offsets is None else order[: order.index(offsets)]
+        curves = [e for e in ahead if e.source.id in CURVES and not _is_idle(e) and not _reason(e, {}, self.only, self.skip)]
+        if offsets is None or not curves:
+            return stack
+        codes, shape = np.arange(2**self.bits, dtype=np.uint16), self.camera.output_shape
+        every = np.resize(codes, (-(-codes.size // (shape[0] * shape[1])), *shape))
+        signal = _signal_of(every, shape, Kind.CODES, self.camera, None)
+        straight, _ = correct_signal(self.camera, signal, {}, only=[e.name for e in curves], until=offsets.name)
+        table: np.ndarray = straight.data.reshape(-1)[: codes.size]
+        return table[stack]
 
     @property
     def covered(self) -> Covered | None:
