@@ -14,6 +14,7 @@ from pixmetry.cli._console import echo
 from pixmetry.cli._json import JsonResult, json_option
 
 if TYPE_CHECKING:
+    from pixmetry.capture.follow import Followed
     from pixmetry.capture.plan import Step
     from pixmetry.capture.records import Captured
 
@@ -42,6 +43,23 @@ EXIT_NOT_REACHED = 1
 @click.option(
     "--fact", "facts", multiple=True, metavar="KEY=VALUE", help="Of the camera, for the manifest: pitch_um=3.45. May be repeated."
 )
+@click.option(
+    "--locate", is_flag=True, help="Follow a fixed field of targets in place of a shooting list: drift, jitter, when it is stable."
+)
+@click.option("--kind", type=click.Choice(["disc", "ellipse", "ring", "spot"]), default="disc", show_default=True, help="Of the targets.")
+@click.option("--exposure-s", type=click.FloatRange(0, min_open=True), metavar="S", help="With --locate. Default: as the camera is set.")
+@click.option("--frames", type=click.IntRange(1), help="With --locate: how many, those of earlier runs included.")
+@click.option("--minutes", type=click.FloatRange(0, min_open=True), help="With --locate: for how long. Default: until Ctrl-C.")
+@click.option("--interval", "interval_s", type=click.FloatRange(0), default=0.0, metavar="S", help="With --locate: from frame to frame.")
+@click.option("--on-for", "on_for_s", type=click.FloatRange(0), default=0.0, metavar="S", help="With --locate: as of `pixmetry series`.")
+@click.option(
+    "--tolerance",
+    "tolerance_px",
+    type=click.FloatRange(0, min_open=True),
+    default=0.05,
+    metavar="PX",
+    help="With --locate: what is stable.",
+)
 @click.option("--yes", is_flag=True, help="Do not wait for the scene to be made: somebody else sees to it.")
 @json_option("the result")
 def capture(
@@ -56,6 +74,14 @@ def capture(
     raw: str | None,
     answers: tuple[str, ...],
     facts: tuple[str, ...],
+    locate: bool,
+    kind: str,
+    exposure_s: float | None,
+    frames: int | None,
+    minutes: float | None,
+    interval_s: float,
+    on_for_s: float,
+    tolerance_px: float,
     yes: bool,
     json_file: Path | None,
 ) -> None:
@@ -63,6 +89,9 @@ def capture(
 
     SOURCE is folder:PATH (another program records into it), basler or aravis, the two latter with :NAME if there are several cameras. A
     capture that was stopped or killed goes on with the same command.
+
+    With --locate no frames are kept: targets are followed on the stream, positions go to FOLDER.frames.jsonl, and FOLDER gets report.html
+    and series.json as of `pixmetry series`. Ctrl-C ends it and writes them.
 
     Exit status: 0; 1 if the wanted u was not reached; 2 after an error.
 
@@ -74,6 +103,10 @@ def capture(
     from pixmetry.capture.records import CAPTURE_SCHEMA
     from pixmetry.cli._progress import shown_progress
 
+    if locate:
+        options = {"exposure_s": exposure_s, "frames": frames, "seconds": None if minutes is None else 60 * minutes, "kind": kind}
+        _follow(source, output, bits, raw, json_file, interval_s=interval_s, on_for_s=on_for_s, tolerance_px=tolerance_px, **options)
+        return
     written = JsonResult(json_file, CAPTURE_SCHEMA, inputs=[])
     numbers = {key: float(value) for key, value in map(_pair, answers) if _is_number(key, value)}
     kinds = [kind.strip() for kind in only.split(",")] if only else [] if described else ["flat"]
@@ -104,6 +137,46 @@ def capture(
         print_captured(found)
     if not all(r.is_reached for r in found.reached):
         click.get_current_context().exit(EXIT_NOT_REACHED)
+
+
+def _follow(source: str, output: Path, bits: int | None, raw: str | None, json_file: Path | None, **options: Any) -> None:
+    """Follow targets on the stream, and tell what was found."""
+    from pixmetry.capture.cameras import open_camera
+    from pixmetry.capture.follow import FOLLOWED_SCHEMA, follow
+    from pixmetry.cli.series import summary_lines
+
+    written = JsonResult(json_file, FOLLOWED_SCHEMA, inputs=[])
+    camera = open_camera(source, bits, raw)
+    try:
+        found = follow(camera, output, tell=lambda line: echo(line, err=True), **options)
+    finally:
+        camera.close()
+    written.put(found.to_record())
+    if written.printed:
+        return
+    for line in [*summary_lines(found.series), *repeat_lines(found)]:
+        echo(line)
+    echo(f"report: {found.report}")
+
+
+def repeat_lines(found: Followed) -> list[str]:
+    """How the targets of a stream repeat, and the faults of its frames, in words."""
+    from math import isnan
+
+    from numpy import nanmedian
+
+    from pixmetry.report.numbers import significant
+
+    s = found.statistics
+    repeat, stated = (
+        float(nanmedian(getattr(s, f"{n}_x_px") ** 2 + getattr(s, f"{n}_y_px") ** 2) / 2) ** 0.5 for n in ("repeat", "stated")
+    )
+    faults = ", ".join(f"{count} {kind}" for kind, count in found.faults.items())
+    lines = [] if isnan(repeat) else [f"one position repeats within {significant(repeat, 2)} px; stated: {significant(stated, 2)} px"]
+    if not isnan(s.common_x_px):
+        common = f"{significant(s.common_x_px, 2)} px in x, {significant(s.common_y_px, 2)} px in y"
+        lines.append(f"common to all targets from frame to frame: {common}")
+    return lines + ([f"faulty frames: {faults}"] if faults else [])
 
 
 class Terminal:
