@@ -12,7 +12,19 @@ from pixmetry.core import compiling
 from pixmetry.core.jit import jit
 from pixmetry.locate.estimators import estimators
 
-WITHOUT_KERNELS = {"sources", "compare", "shoot-list", "series", "init", "capture", "board", "bench", "view", "warm-up"}  # of their own
+WITHOUT_KERNELS = {  # of their own
+    "sources",
+    "compare",
+    "fleet",
+    "shoot-list",
+    "series",
+    "init",
+    "capture",
+    "board",
+    "bench",
+    "view",
+    "warm-up",
+}
 
 
 @pytest.fixture

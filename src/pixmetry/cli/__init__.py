@@ -49,6 +49,7 @@ COMMANDS = {
     "correct": "Correct frames for what is known of their camera, measured or described.",
     "corrected": "Correct positions for what is known of their camera's geometry.",
     "compare": "Compare measurements with each other, with a fleet of cameras, or with limits.",
+    "fleet": "Put many cameras on one page: distributions, cameras that stand out, limits, drift over time.",
     "warm-up": "Compile the kernels of all commands, so that no command waits for it later.",
 }
 
