@@ -29,7 +29,8 @@ def fleet(folders: tuple[Path, ...], output: Path | None, limits: Path | None, l
 
     Example: pixmetry fleet results/ --limits limits.yaml -o fleet
     """
-    from pixmetry.assess.judge.fleet import FLEET_SCHEMA, KIND, fleet_report, result_files, write_fleet
+    from pixmetry.assess.judge.fleet import FLEET_SCHEMA, fleet_report, result_files
+    from pixmetry.assess.judge.fleet_files import KIND, write_fleet
     from pixmetry.assess.judge.fleet_page import named, sentences
     from pixmetry.cli._progress import shown_progress
     from pixmetry.core.extras import import_extra

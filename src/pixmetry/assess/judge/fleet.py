@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import math
 from collections.abc import Iterable, Sequence
@@ -19,15 +17,11 @@ from pixmetry.assess.judge.conformity import Checked, Judgement, Limits, judge
 from pixmetry.assess.judge.differences import Subject, family, holm, is_there, upper_tail
 from pixmetry.assess.judge.subjects import RESULT_FILES, load_subject
 from pixmetry.core.errors import InputError
-from pixmetry.core.extras import import_extra
 from pixmetry.core.number import Number
-from pixmetry.core.plain_text import cell
 from pixmetry.core.progress import Progress, no_progress
 from pixmetry.emva.files.json_format import SCHEMA as SHEET_SCHEMA
-from pixmetry.files.output import staged_output
-from pixmetry.files.results import write_record
 
-KIND, FLEET_SCHEMA = "fleet", "pixmetry/fleet-page/1"
+FLEET_SCHEMA = "pixmetry/fleet-page/1"
 FAR_SPREADS = 3.0  # from the median: the band that an odd camera is held against, with its own u
 YEAR_S = 365.25 * 86400
 LEAST_SPAN_S = 60.0  # between the results of one camera: shorter is one measurement
@@ -155,7 +149,7 @@ class FleetReport:
             for camera, rows in self.limits.items()
             for c in rows
         ]
-        drifts = [dict(zip(DRIFT_COLUMNS, _drift_row(d), strict=True)) for d in self.drifts]
+        drifts = [dict(zip(DRIFT_COLUMNS, drift_row(d), strict=True)) for d in self.drifts]
         fleet = {**self.fleet.to_record(), "notes": list(self.notes)}
         return {"schema": FLEET_SCHEMA, "results": len(self.members), "fleet": fleet, "odd": odd, "limits": limits, "drifts": drifts}
 
@@ -304,7 +298,7 @@ def _slope(camera: str, place: tuple[str, str], held: Sequence[tuple[float, Numb
     return Drift(camera, *place, held[0][1].unit, len(held), float(np.ptp(t)), slope, u_slope, p)
 
 
-def _drift_row(d: Drift) -> tuple[Any, ...]:
+def drift_row(d: Drift) -> tuple[Any, ...]:
     return (d.camera, d.channel, d.key, d.unit, d.results, d.years, d.per_year, d.u_per_year, d.p, d.drifts)
 
 
@@ -312,47 +306,3 @@ def _utc(time_s: float) -> str:
     from datetime import UTC
 
     return "" if math.isnan(time_s) else datetime.fromtimestamp(time_s, UTC).isoformat(timespec="seconds")
-
-
-def write_fleet(found: FleetReport, output: str | Path, inputs: Iterable[Path] = (), *, parquet: bool = False) -> Path:
-    """Write page, record and tables into a folder, whole or not at all; return the path of the page.
-
-    Raises
-    ------
-    InputError
-        If something would be lost there, or Parquet is asked for and pyarrow is not installed.
-    """
-    from pixmetry.assess.judge.fleet_page import page_of
-    from pixmetry.report import html_of
-
-    if parquet:
-        import_extra("pyarrow.parquet")
-    tables = {"values": (VALUE_COLUMNS, found.value_rows()), "drifts": (DRIFT_COLUMNS, [_drift_row(d) for d in found.drifts])}
-    with staged_output(output, KIND, (), inputs) as folder:
-        (folder / "report.html").write_text(html_of(page_of(found)), encoding="utf-8")
-        write_record(folder / "fleet.json", found.to_record())
-        for name, (columns, rows) in tables.items():
-            if parquet:
-                (folder / f"{name}.parquet").write_bytes(_parquet(columns, rows))
-            else:
-                (folder / f"{name}.csv").write_text(_csv(columns, rows), encoding="utf-8")
-    return Path(output) / "report.html"
-
-
-def _csv(columns: Sequence[str], rows: Sequence[tuple[Any, ...]]) -> str:
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(columns)
-    for row in rows:
-        writer.writerow([cell(v) if isinstance(v, str) else "" if isinstance(v, float) and math.isnan(v) else v for v in row])
-    return text.getvalue()
-
-
-def _parquet(columns: Sequence[str], rows: Sequence[tuple[Any, ...]]) -> bytes:
-    parquet = import_extra("pyarrow.parquet")
-    import pyarrow
-
-    table = pyarrow.table({name: pyarrow.array([row[k] for row in rows]) for k, name in enumerate(columns)})
-    sink = io.BytesIO()
-    parquet.write_table(table.replace_schema_metadata({"schema": FLEET_SCHEMA}), sink)
-    return sink.getvalue()
