@@ -17,7 +17,7 @@ PYTEST := OPENBLAS_NUM_THREADS=1 $(PY) -m pytest -n $(JOBS) --dist loadfile --hy
 QUICK := $(PYTEST) -m "not browser and not oracle" --durations=15 --durations-min=5
 
 .DEFAULT_GOAL := help
-.PHONY: help install demo test flaky oracles study bench mutants fuzz handbook handbook-check docs lint browser-test
+.PHONY: help install demo test flaky oracles study bench mutants fuzz faults handbook handbook-check docs lint browser-test
 
 help: ## show this list
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1|\2/p' $(MAKEFILE_LIST) | while IFS='|' read -r target text; do printf '%-20s %s\n' "$$target" "$$text"; done
@@ -48,6 +48,9 @@ mutants: $(INSTALLED)-test ## plant wrong factors, one at a time, and see whethe
 
 fuzz: $(INSTALLED)-all ## damage small files for SECONDS=600 and open them at every door: tracebacks, silent wrong answers, memory
 	@OPENBLAS_NUM_THREADS=1 $(PY) scripts/fuzz.py --seconds $(SECONDS)
+
+faults: $(INSTALLED)-all ## kill commands, or fill the disk, at every operation on their output: the old or the new result must stand there
+	@$(PY) scripts/faults.py
 
 handbook: $(INSTALLED)-all ## run the handbook's experiments and write docs/handbook (ONLY="PAGE ...": run some)
 	@$(PY) scripts/make_handbook.py $(ONLY)

@@ -6,6 +6,7 @@ import errno
 import json
 import math
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -18,7 +19,7 @@ import pytest
 
 from files.failing import FAULTS, Failing
 from pixmetry.core.errors import InputError
-from pixmetry.files import InputHashes, check_output, provenance_record, read_maps, staged_output, write_json, write_maps
+from pixmetry.files import InputHashes, check_output, output, provenance_record, read_maps, staged_output, write_json, write_maps
 from pixmetry.files.output import MARKER, _host
 from pixmetry.files.strict_json import json_text
 
@@ -394,3 +395,25 @@ def test_provenance_names_inputs_but_no_folders(tmp_path: Path) -> None:
     path = tmp_path / "provenance.json"
     write_json(path, record)
     assert str(tmp_path) not in path.read_text(encoding="utf-8")
+
+
+def test_what_a_killed_run_left_beside_files_is_cleaned_by_the_next(tmp_path: Path) -> None:
+    """Killed before each of its renames and removals; what a run that still works has written stays."""
+    target = tmp_path / "a.json"
+    mark = re.compile(rb"\{")
+    program = (
+        "import os, re, sys; from pathlib import Path; from pixmetry.files import output; call = getattr(os, sys.argv[2])\n"
+        "setattr(os, sys.argv[2], lambda *a, **k: os._exit(77))\n"
+        "output.write_together([output.Output(Path(sys.argv[1]), re.compile(rb'\\{'))], [b'{2}'])"
+    )
+    for call in ("fsync", "link", "replace", "unlink"):
+        output.write_together([output.Output(target, mark)], [b"{1}"])
+        killed = subprocess.run([sys.executable, "-c", program, str(target), call], check=False)
+        assert killed.returncode == 77 and len(list(tmp_path.iterdir())) > 1
+        assert target.read_bytes() == (b"{2}" if call == "unlink" else b"{1}")
+        working = tmp_path / f".a.json.partial-{output._host()}-{os.getpid()}-01234567"
+        working.write_bytes(b"")
+        output.write_together([output.Output(target, mark)], [b"{3}"])
+        assert sorted(p.name for p in tmp_path.iterdir()) == sorted([working.name, "a.json"])
+        assert target.read_bytes() == b"{3}"
+        working.unlink()

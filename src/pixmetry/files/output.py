@@ -132,7 +132,7 @@ def write_together(outputs: Sequence[Output], contents: Sequence[bytes], inputs:
 
     Each is written under another name first; then all take their places. If one cannot, those that had taken theirs give way to the files
     that were there before. A run that is killed between the first and the last of these steps can leave new files beside old ones, each
-    of them whole, and the old ones beside them under names that end in ``.old``.
+    of them whole, and the old ones beside them under names that end in ``.old``; the next run to the same names removes these.
 
     Parameters
     ----------
@@ -154,6 +154,7 @@ def write_together(outputs: Sequence[Output], contents: Sequence[bytes], inputs:
             if output.make_folder:
                 step.path.parent.mkdir(parents=True, exist_ok=True)
         for step, raw in zip(steps, contents, strict=True):
+            step.clear_stale()
             step.prepare(raw)
         for step in steps:
             step.take_place()
@@ -192,6 +193,7 @@ def streamed_file(output: Output, inputs: Iterable[Path] = ()) -> Iterator[Binar
     try:
         if output.make_folder:
             step.path.parent.mkdir(parents=True, exist_ok=True)
+        step.clear_stale()
         with step.partial.open("xb") as file:
             yield file
             file.flush()
@@ -241,9 +243,20 @@ class _Step:
     """
 
     def __init__(self, path: Path) -> None:
-        name = f".{_stem(path)}.partial-{os.getpid()}-{secrets.token_hex(4)}"
+        name = f".{_stem(path)}.partial-{_host()}-{os.getpid()}-{secrets.token_hex(4)}"
         self.path, self.partial, self.old = path, path.with_name(name), path.with_name(f"{name}.old")
         self.earlier, self.prepared = path.exists(), False
+
+    def clear_stale(self) -> None:
+        """Remove what runs on this machine that were killed have left for this file."""
+        form = re.compile(re.escape(f".{_stem(self.path)}.partial-{_host()}-") + rf"(\d+)-[0-9a-f]{{8}}({re.escape(OLD)})?")
+        with suppress(OSError):
+            for path in self.path.parent.iterdir():
+                match = form.fullmatch(path.name)
+                if (
+                    match and not _runs(int(match[1])) and (self.path.exists() or not match[2])
+                ):  # an earlier result is kept where no other is
+                    path.unlink()
 
     def prepare(self, raw: bytes) -> None:
         """Write the content, and keep the earlier file under a second name."""
