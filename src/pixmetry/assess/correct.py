@@ -20,6 +20,7 @@ from pixmetry.camera.line import Line
 from pixmetry.camera.overrides import changed_camera, with_source
 from pixmetry.camera.provenance import MEASURED, TYPICAL
 from pixmetry.camera.signal import Kind, Signal
+from pixmetry.core.arguments import typed
 from pixmetry.core.errors import InputError, MeasureError, ParameterError
 from pixmetry.core.progress import Progress, no_progress
 from pixmetry.core.random import Grid, Streams
@@ -324,6 +325,7 @@ class Correction:
         return float(np.prod(known)) if known else float("nan")
 
 
+@typed
 def correct(
     frames: np.ndarray | str | Path | Sequence[str | Path],
     with_: Camera | str | Path,

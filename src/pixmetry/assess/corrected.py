@@ -29,6 +29,7 @@ from pixmetry.camera.catalogue import sources
 from pixmetry.camera.observations import AFFINITY, LENS, TAKEN_UP
 from pixmetry.camera.overrides import with_source
 from pixmetry.camera.provenance import MEASURED, TYPICAL
+from pixmetry.core.arguments import typed
 from pixmetry.core.errors import InputError
 from pixmetry.files.output import Output, check_files, write_together
 
@@ -217,6 +218,7 @@ def checked_output(path: str | Path, form: str, inputs: Iterable[Path] = ()) -> 
     return output
 
 
+@typed
 def corrected(
     table: Any,
     with_: Camera | str | Path,

@@ -25,6 +25,7 @@ from pixmetry.camera.camera import Camera
 from pixmetry.camera.catalogue import sources
 from pixmetry.camera.geometry import frame_centre
 from pixmetry.camera.observations import CameraGeometry, Observations
+from pixmetry.core.arguments import typed
 from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.number import Estimates
 from pixmetry.core.progress import Progress, no_progress
@@ -57,6 +58,7 @@ TARGET_BEFORE_LENS = (
 )
 
 
+@typed
 def assess(
     campaign: str | Path | Campaign | None = None,
     output: str | Path | None = None,

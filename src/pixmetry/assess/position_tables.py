@@ -15,7 +15,7 @@ import numpy as np
 
 from pixmetry.calibrate.project.tables import Table, read_table
 from pixmetry.core.config import read_text
-from pixmetry.core.door import check_depth
+from pixmetry.core.door import check_depth, one_sentence
 from pixmetry.core.errors import InputError
 from pixmetry.core.plain_text import cell, comment, name_of
 from pixmetry.files.strict_json import json_text
@@ -221,9 +221,14 @@ def read_positions(table: Any, *, x: str | None = None, y: str | None = None, or
         read = _of_json(Path(table)) if form_of(Path(table)) == "json" else _of_text(Path(table))
     elif isinstance(table, Located | Mapping):
         columns = table.columns if isinstance(table, Located) else table
-        read = Positions(np.zeros(0), np.zeros(0), None, {name: np.asarray(v).tolist() for name, v in columns.items()})
+        with one_sentence("no positions", "table", allowed="columns of one length by their names", remedy="check the argument"):
+            lists = {name: np.atleast_1d(np.asarray(v)).tolist() for name, v in columns.items()}
+        if not all(isinstance(name, str) for name in lists) or len({len(v) for v in lists.values()}) > 1:
+            raise InputError("no positions", where="table", allowed="columns of one length by their names", remedy="check the argument")
+        read = Positions(np.zeros(0), np.zeros(0), None, lists)
     else:
-        at = np.asarray(table, float)
+        with one_sentence("no positions", "table", allowed="a file, a table, or an array of shape (n, 2)", remedy="check the argument"):
+            at = np.asarray(table, float)
         if at.ndim != 2 or at.shape[1] != 2:
             raise InputError(
                 "no positions", where="table", value=f"shape {at.shape}", allowed="a file, a table, or an array of shape (n, 2)"

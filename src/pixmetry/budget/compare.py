@@ -16,6 +16,7 @@ import numpy as np
 from pixmetry.budget.answer import Answer, answer_of, rms
 from pixmetry.budget.camera_budget import SCHEMA, CameraBudget
 from pixmetry.budget.table import AT_BOUND, TYPICAL, Pair, Parts, SourceRow
+from pixmetry.core.arguments import typed
 from pixmetry.core.checksums import check_record
 from pixmetry.core.door import read_bytes
 from pixmetry.core.errors import InputError
@@ -251,6 +252,7 @@ def _parts(record: Mapping[str, Any] | None) -> Parts | None:
 # ---- comparing ---------------------------------------------------------------------------------------------------------------------
 
 
+@typed
 def compare_budgets(sources: Iterable[CameraBudget | str | Path], names: Sequence[str] | None = None) -> BudgetComparison:
     """Compare budgets: two cameras, three lenses, one camera before and after a change.
 

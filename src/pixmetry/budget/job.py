@@ -34,6 +34,7 @@ from pixmetry.calibrate.files.record import StoredCalibration
 from pixmetry.calibrate.records import Calibration
 from pixmetry.camera.camera import Camera
 from pixmetry.camera.observations import TAKEN_UP, CameraGeometry
+from pixmetry.core.arguments import typed
 from pixmetry.core.number import Estimates
 from pixmetry.locate.estimator import Estimator
 from pixmetry.locate.target_estimator import TargetEstimator
@@ -144,6 +145,7 @@ def compute_budget(
     )
 
 
+@typed
 def budget(
     camera: str | Path | Camera | Sequence[str | Path | Camera],
     scenario: str | Path | Mapping[str, Any] | Scenario | None = None,

@@ -19,6 +19,7 @@ from pixmetry.camera.provenance import check_provenance, estimates_of, provenanc
 from pixmetry.camera.signal import Clock, Kind, Signal, Windows
 from pixmetry.camera.source import run
 from pixmetry.camera.unit_maps import MeasuredUnit, check_frame, check_maps, listing, maps_file, read_unit_maps, write_unit_maps
+from pixmetry.core.arguments import typed
 from pixmetry.core.checksums import check_file
 from pixmetry.core.door import check_pixels
 from pixmetry.core.errors import ChainError, InputError
@@ -731,6 +732,7 @@ def build_camera(record: Mapping[str, Any], where: str = "camera", folder: str |
     return Camera(checked.name, (checked.rows, checked.cols), tuple(elements), pitch, measured=measured, **settings)
 
 
+@typed
 def load_camera(path: str | Path) -> Camera:
     """Read a camera from its YAML file or a data-sheet file, or one of those that come with pixmetry by its name.
 

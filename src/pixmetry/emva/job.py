@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from pixmetry.camera.observations import StackMoments
+from pixmetry.core.arguments import typed
 from pixmetry.core.errors import InputError, MeasureError
 from pixmetry.core.progress import Progress, no_progress
 from pixmetry.core.threads import imap_tiles, map_tiles, single_threaded_blas
@@ -41,6 +42,7 @@ class Options:
             raise InputError("not a number of draws", where="bootstrap", value=self.bootstrap, allowed="0, or 100 to 1000000")
 
 
+@typed
 def emva1288(
     campaign: str | Path | Campaign | None = None,
     *,

@@ -252,12 +252,15 @@ def check_head(head: bytes, path: Path) -> None:
     """
     with _told_of(path):
         if head.startswith(PNG) and len(head) >= 24:
-            check_pixels(*struct.unpack_from(">II", head, 16))
+            cols, rows = struct.unpack_from(">II", head, 16)
+            check_pixels(cols, rows)
         elif head.startswith(bmp.SIGNATURE) and len(head) >= 26:
-            check_pixels(*map(abs, struct.unpack_from("<ii", head, 18)))
+            cols, rows = struct.unpack_from("<ii", head, 18)
+            check_pixels(abs(cols), abs(rows))
         elif head.startswith(_NPY):
             shape = _npy_head(partial(_part_of, head), None)[1]
-            check_pixels(*(shape[-1:-3:-1] if len(shape) < 4 else shape[2:0:-1]) if len(shape) > 1 else (1, 1))
+            rows, cols = (1, 1) if len(shape) < 2 else shape[-2:] if len(shape) < 4 else shape[1:3]
+            check_pixels(cols, rows)
 
 
 @contextmanager

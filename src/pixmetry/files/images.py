@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pixmetry.camera.observations import Storage
+from pixmetry.core.arguments import typed
 from pixmetry.core.door import open_file
 from pixmetry.core.errors import InputError
 from pixmetry.core.memory import check_memory
@@ -52,6 +53,7 @@ class LoadedFrame(NamedTuple):
     table: tuple[int, ...] | None = None  # luminance quantiser of a JPEG
 
 
+@typed
 def read_frame(path: str | Path) -> np.ndarray:
     """Read one frame.
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from pixmetry.camera.motion_series import MotionSeries
 from pixmetry.camera.recordings import Recordings
+from pixmetry.core.arguments import typed
 from pixmetry.core.arrays import Array
 from pixmetry.core.config import read_text
 from pixmetry.core.errors import InputError, MeasureError
@@ -43,6 +44,7 @@ TEXTURE = "texture"
 Fetch = Callable[[], np.ndarray]
 
 
+@typed
 def series(
     frames: str | Path | Sequence[str | Path],
     output: str | Path | None = None,

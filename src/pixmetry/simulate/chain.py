@@ -13,6 +13,7 @@ from pixmetry.camera.camera import Camera, load_camera
 from pixmetry.camera.conversions import HOLD, LOOK, SAMPLE, LineSources, Link, look
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.camera.source import run
+from pixmetry.core.arguments import typed
 from pixmetry.core.errors import InputError
 from pixmetry.core.random import Grid
 
@@ -131,6 +132,7 @@ class Walk:
         }
 
 
+@typed
 def chain(camera: str | Path | Camera, scene: Any, *, target: int | None = None, frame: int = 0, seed: int = 0, draws: int = 1) -> Walk:
     """Follow one target through a camera.
 

@@ -12,6 +12,7 @@ import numpy as np
 from pixmetry.camera.camera import Camera, load_camera
 from pixmetry.camera.overrides import changed_camera
 from pixmetry.camera.signal import Kind
+from pixmetry.core.arguments import typed
 from pixmetry.core.errors import InputError
 from pixmetry.core.memory import check_memory
 from pixmetry.core.progress import Progress, no_progress
@@ -83,6 +84,7 @@ class _Part:
     entry: Mapping[str, Any] | None = None
 
 
+@typed
 def simulate(
     camera: str | Path | Camera,
     scene: str | Path | Mapping[str, Any],

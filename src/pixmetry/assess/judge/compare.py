@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from pixmetry.assess.judge.differences import Difference, FleetRow, Subject, decided, difference_of, family, fleet_chance, fleet_row, holm
 from pixmetry.assess.judge.subjects import CALIBRATED, load_subject
+from pixmetry.core.arguments import typed
 from pixmetry.core.errors import InputError
 from pixmetry.emva.files.json_format import value_record
 from pixmetry.emva.records import MONO, DataSheet
@@ -83,6 +84,7 @@ def _head(schema: str, result: Comparison | Fleet) -> dict[str, Any]:
     return {"schema": schema, "names": names, "kind": result.kind, "level": result.level, "same": result.same, "notes": notes}
 
 
+@typed
 def compare(
     a: DataSheet | str | Path, b: DataSheet | str | Path, *, level: float = 0.95, same_light: bool = False, names: Sequence[str] = ("", "")
 ) -> Comparison:
@@ -129,6 +131,8 @@ def compare(
     (False, ['K', 'inverse_K'])
     """
     _check_level(level)
+    if len(names) != 2:
+        raise InputError("not the names of two", where="names", value=len(names), allowed="two texts")
     one, two = load_subject(a, names[0]), load_subject(b, names[1])
     if one.kind != two.kind:
         raise InputError(f"{one.name} is a {one.kind} and {two.name} a {two.kind}", remedy="compare two of one kind")
@@ -196,6 +200,7 @@ def _listed(sizes: Sequence[float]) -> str:
     return ", ".join(f"{size:.3g}" for size in sizes)
 
 
+@typed
 def compare_fleet(sources: Iterable[DataSheet | str | Path], *, level: float = 0.95, names: Sequence[str] | None = None) -> Fleet:
     """Compare each camera of a fleet with the fleet.
 
@@ -261,6 +266,7 @@ def compare_fleet(sources: Iterable[DataSheet | str | Path], *, level: float = 0
     return Fleet(tuple(s.name for s in subjects), kinds[0], level, tuple(rows), tuple(notes))
 
 
+@typed
 def check_limits(source: DataSheet | str | Path, limits: Limits | str | Path) -> tuple[Checked, ...]:
     """Check the values of one camera against limits, each key in every channel.
 
