@@ -208,8 +208,8 @@ def commands() -> list[Command]:
         Command("locate json", ["locate", "in/f1", "-o", "out/t.json"], ["locate", "in/f2", "-o", "out/t.json"]),
         Command(
             "budget",
-            ["budget", camera, "--json", "out/b.json", "--report", "out/b.html"],
-            ["budget", camera, "--json", "out/b.json", "--report", "out/b.html", "--set", "exposure_s=0.02"],
+            ["budget", camera, "--json", "out/b.json", "--html", "out/b.html"],
+            ["budget", camera, "--json", "out/b.json", "--html", "out/b.html", "--set", "exposure_s=0.02"],
         ),
         Command(
             "correct",
