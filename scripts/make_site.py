@@ -36,7 +36,7 @@ SECTIONS = {  # of the site, and the pages of each; a page that stands in none s
     "Measure with a camera": ["locating", "calibrating", "correct", "bound"],
     "Budget and simulate": ["budget", "bench", "data-sheets", "cameras", "scenes", "simulate"],
     "Handbook": ["handbook/index"],
-    "Reference": ["sources/index", "api/index", "glossary", "conventions"],
+    "Reference": ["sources/index", "api/index", "glossary", "conventions", "files"],
     "Develop": ["architecture", "adding-a-source", "decisions", "contributing", "changes"],
 }
 CONF: dict[str, Any] = {
