@@ -334,3 +334,28 @@ def test_cache_folder_falls_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(module.tempfile, "gettempdir", lambda: str(tmp_path))
     root = module._cache_root()
     assert root.parent == tmp_path and root.stat().st_mode & 0o022 == 0
+
+
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="no owners of files")
+def test_compiled_code_that_others_may_have_written_is_not_executed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    own, others = tmp_path / "own", tmp_path / "others"
+    for folder in (own, others):
+        (folder / "kernels" / "0123").mkdir(parents=True)
+        (folder / "kernels" / "0123" / "a.nbc").write_bytes(b"")
+        (folder / "kernels").chmod(0o777)
+    monkeypatch.setenv("PIXMETRY_CACHE_DIR", str(own))
+    assert module._cache_root() == own / "kernels"
+    assert not list((own / "kernels").iterdir()) and (own / "kernels").stat().st_mode & 0o077 == 0
+    monkeypatch.setenv("PIXMETRY_CACHE_DIR", str(others))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "user"))
+    uid = os.getuid()
+    place = (others / "kernels").stat().st_ino
+    stat = Path.stat
+
+    def of_others(path: Path, **options: bool) -> os.stat_result:
+        found = stat(path, **options)
+        return os.stat_result((*found[:4], uid + 1, *found[5:])) if found.st_ino == place else found
+
+    monkeypatch.setattr(Path, "stat", of_others)
+    assert module._cache_root() == tmp_path / "user" / "pixmetry" / "kernels"
+    assert (others / "kernels" / "0123" / "a.nbc").exists()

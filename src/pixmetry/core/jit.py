@@ -406,22 +406,32 @@ def _cache_root() -> Path:
     user = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()) / "pixmetry"
     for folder in ([Path(asked)] if asked else []) + [user]:
         try:
-            (folder / "kernels").mkdir(parents=True, exist_ok=True)
+            (folder / "kernels").mkdir(mode=0o700, parents=True, exist_ok=True)
+            if _is_ours(folder / "kernels") and os.access(folder / "kernels", os.W_OK | os.X_OK):
+                return folder / "kernels"
         except OSError:
             continue
-        if os.access(folder / "kernels", os.W_OK | os.X_OK):
-            return folder / "kernels"
     return _temporary_root()
 
 
+def _is_ours(folder: Path) -> bool:
+    """Whether a folder belongs to this user; its code is executed, so one that others can write to is closed to them, and emptied."""
+    status = folder.stat()
+    if not hasattr(os, "getuid"):
+        return True
+    if status.st_uid != os.getuid():
+        return False
+    if status.st_mode & 0o022:
+        folder.chmod(0o700)
+        for inside in folder.iterdir():  # what stands in it may be anybody's
+            shutil.rmtree(inside) if inside.is_dir() and not inside.is_symlink() else inside.unlink()
+    return True
+
+
 def _temporary_root() -> Path:
-    # Cached code is executed, so a folder in a shared place must belong to this user and to nobody else.
     folder = Path(tempfile.gettempdir()) / f"pixmetry-kernels-{getattr(os, 'getuid', int)()}"
     folder.mkdir(mode=0o700, exist_ok=True)
-    status = folder.stat()
-    if hasattr(os, "getuid") and (status.st_uid != os.getuid() or status.st_mode & 0o022):
-        return Path(tempfile.mkdtemp(prefix="pixmetry-kernels-"))
-    return folder
+    return folder if _is_ours(folder) else Path(tempfile.mkdtemp(prefix="pixmetry-kernels-"))
 
 
 def _remove_old(root: Path) -> None:
