@@ -16,9 +16,7 @@ from pixmetry.locate.noise import NoiseModel
 
 OPERATORS = {"perimeter": o.PERIMETER, "forstner": o.FORSTNER, "ellipse_edges": o.ELLIPSE_EDGES, "gaussian": o.GAUSSIAN}
 ASTRAY_PX = 1.0
-NEGLIGIBLE = (
-    0.003  # of the variance by noise: a rough variance over the phase that may stand for the whole one, which is up to a few times that
-)
+NEGLIGIBLE, SMALL = 0.02, 0.1  # of the variance by noise: variances over the phase of which a few phases, and half of them, tell enough
 MARGINS = {"perimeter": 3.0, "forstner": 3.0, "ellipse_edges": 3.0, "gaussian": 4.0}
 RIM_PX = 2.0  # between window and border: 1.5 that gradients and rays read around the window, and a window's way from the rough centre
 
@@ -55,7 +53,8 @@ def operator_positions(frame: np.ndarray, targets: Targets, noise: NoiseModel, n
     has none, through the chance of each pixel to be taken over the threshold. The slopes of ``gaussian`` hold that its window follows
     the estimate (`gaussian_of` in the kernels has the formula): that is 12 % on a disc of radius 12 px and blur 2 px. The variance over
     the sub-pixel phase is added: that of the operator itself on noise-free images of targets of like size, blur and shape, the largest
-    over half a pixel of sizes (roughly where it is less than 0.3 % of the former), on pixels that are sensitive on their whole square.
+    over half a pixel of sizes (roughly where it is less than 2 % of the former, to a third where it is less than 10 %), on pixels that
+    are sensitive on their whole square.
 
     References
     ----------
@@ -94,12 +93,17 @@ def _phase_variance(work: Prepared, operator: int, noise_px2: np.ndarray, thread
     for column in (0, 2, 3, 7):
         shape[:, column] = np.maximum(shape[:, column] - large, 0.5)
     steps = (np.arange(4) + 0.37) / 4 - 0.5
-    phases = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+    row, col = np.divmod(np.arange(16), 4)  # first the diagonal, then the other fields of its colour on the chessboard
+    phases = np.stack([steps[col], steps[row]], axis=1)[np.argsort((row != col) + 2 * ((row + col) % 2), kind="stable")]
     nodes, weights = np.polynomial.legendre.leggauss(12)
     out, least = np.zeros(len(shape)), np.full(len(shape), np.inf)
     np.fmin.at(least, of, np.where(np.isfinite(noise_px2), noise_px2, 0.0))
-    negligible = NEGLIGIBLE * least
-    run_slices(lambda a, b: o.phase_variances(shape, a, b, operator, phases, nodes, weights, COLUMNS, negligible, out), len(shape), threads)
+    negligible, small = NEGLIGIBLE * least, SMALL * least
+
+    def fill(a: int, b: int) -> None:
+        o.phase_variances(shape, a, b, operator, phases, nodes, weights, COLUMNS, negligible, small, out)
+
+    run_slices(fill, len(shape), threads)
     phase: np.ndarray = out[of]
     return phase
 
