@@ -275,8 +275,11 @@ def _robust_fit(design: np.ndarray, z: np.ndarray, noise: float) -> np.ndarray:
     residual = np.abs(z - np.median(z))
     fit = np.zeros(design.shape[1])
     for step in range(12):
-        scale = max(1.5 * float(np.median(residual)), least)
-        weight = 1 / np.maximum(residual, least) if step < 6 else np.maximum(1 - (residual / (5 * scale)) ** 2, 1e-6) ** 2
+        if step < 6:
+            weight = 1 / np.maximum(residual, least)
+        else:
+            scale = max(1.5 * float(np.median(residual)), least)
+            weight = np.maximum(1 - (residual / (5 * scale)) ** 2, 1e-6) ** 2
         weighted = design.T * weight
         normal = weighted @ design
         fit = np.linalg.solve(normal + 1e-9 * np.trace(normal) / len(fit) * np.eye(len(fit)), weighted @ z)
