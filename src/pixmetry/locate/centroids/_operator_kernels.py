@@ -648,9 +648,9 @@ def phase_variances(
 
     ``shape`` (classes, 8): radius and blur (without the pixel) of the profile, half axes and angle at half height, blur with the pixel,
     margin of the window, and radius at half height. An S-curve swings with the size, over half a pixel or less: the largest of
-    four sizes over that counts. Where the first few phases of two sizes, a quarter of a pixel apart, make less than is ``negligible``, twice
-    what they make on average stands for it, and where they make less than is ``small``, half of the phases do: 0.5 to 2.5 times the
-    whole, and 0.7 to 1.4, of nine classes in ten.
+    four sizes over that counts. Where the first few phases of two sizes, a quarter of a pixel apart, make less than is ``negligible``,
+    twice what they make on average stands for it; where they make less than is ``small``, half of the phases do. That is 0.5 to 2.5 times
+    the whole, and 0.7 to 1.4, of nine classes in ten.
     """
     for i in range(first, stop):
         rough = 0.0
