@@ -329,8 +329,10 @@ def with_correlation(
         some = [] if 1 / UNLIKE < level / known.variance_dn2 < UNLIKE else sample(SAMPLE)
         shared = shared_shape(some, noise) if fitted and noise.origin == "image" else None
         if shared is not None:
-            some = sample(LARGE_SAMPLE)
-            spreads, why = _of_shared_shape(noise, known, shared_shape(some, noise) or shared, drawn, some), BY_SHAPE
+            more_targets = sample(LARGE_SAMPLE)
+            if (larger := shared_shape(more_targets, noise)) is not None:  # else each target stays with what is left of itself
+                shared, some = larger, more_targets
+            spreads, why = _of_shared_shape(noise, known, shared, drawn, some), BY_SHAPE
             relief = _relief(positions, good, noise)
         elif any(differs_clearly(one, noise, known) for one in drawn):
             alike = residual_correlation(some, noise) if some else None

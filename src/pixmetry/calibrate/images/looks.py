@@ -2,7 +2,7 @@
 
 Each cell of the grid (one pitch wide, about a dot's place) is taken from the picture as its neighbours place it, and compared with the
 median of all cells. Cells that look otherwise are marks. Two pictures of one plate are laid upon each other so that their marks agree.
-Part of a plate can be numbered by three marks that are not in a line, or by two where the picture shows that no others would fit.
+Part of a plate is numbered by three marks that are not in a line.
 """
 
 from __future__ import annotations
@@ -156,7 +156,6 @@ class Laid:
 
     quarters: int
     shift: tuple[int, int] = (0, 0)
-    marks: int = 0  # that agree, if they are not in a line
 
 
 def laid_on(whole: Looks, part: Looks, turns: Sequence[int], *, shifted: bool) -> Laid | None:
@@ -181,18 +180,17 @@ def laid_on(whole: Looks, part: Looks, turns: Sequence[int], *, shifted: bool) -
     ways.sort(key=lambda way: -way[0])
     if not ways:
         return None
-    score, same, against, way = ways[0]
+    score, same, way = ways[0]
     clear = score - (ways[1][0] if len(ways) > 1 else -np.inf) >= CLEAR
     if not shifted:
         return way if clear and len(same) and score >= ALIKE else None
     in_plane = len(same) >= LEAST_MARKS and np.linalg.matrix_rank(same - same[0]) == 2
-    undisturbed = len(same) == len(part.row) == 2 and not against  # something over a third mark would let it be anywhere
-    sure = clear and score > 0 and (in_plane or undisturbed)
-    return replace(way, marks=len(same) if in_plane else 0) if sure else None
+    sure = clear and score > 0 and in_plane  # with two, clutter on the other picture may speak against the right way
+    return way if sure else None
 
 
-def _agreement(whole: Looks, part: Looks, shift: tuple[int, int]) -> tuple[float, np.ndarray, int]:
-    """Correlations of marks at the same place, less what contradicts; the places of those that are alike, shape (m, 2); contradictions."""
+def _agreement(whole: Looks, part: Looks, shift: tuple[int, int]) -> tuple[float, np.ndarray]:
+    """Correlations of marks at the same place, less what contradicts; and the places of those that are alike, shape (m, 2)."""
     there = set(zip(whole.row.tolist(), whole.col.tolist(), strict=True))
     here = set(zip((part.row + shift[0]).tolist(), (part.col + shift[1]).tolist(), strict=True))
     score, same, against = 0.0, [], 0
@@ -209,7 +207,7 @@ def _agreement(whole: Looks, part: Looks, shift: tuple[int, int]) -> tuple[float
                 same.append((r, c))
         else:  # a mark that is too faint to be told does not contradict
             against += product < FAINT * (of_whole if (r, c) in there else of_part)
-    return score - AGAINST * against, np.array(same).reshape(-1, 2), against
+    return score - AGAINST * against, np.array(same).reshape(-1, 2)
 
 
 def _shows(seen: np.ndarray, row: int, col: int) -> bool:
@@ -241,7 +239,7 @@ def by_marks(looks: Sequence[Looks], turns: Sequence[int], *, shifted: bool, pla
         found = [Laid(0) if k == reference else laid_on(looks[reference], one, turns, shifted=shifted) for k, one in enumerate(looks)]
         if sum(one is not None for one in found) > sum(one is not None for one in best):
             best = found
-    if sum(one is not None for one in best) < 2 or (shifted and not any(one is not None and one.marks for one in best)):
+    if sum(one is not None for one in best) < 2:
         return nothing
     if shifted:  # what the others add to the plate tells where the rest belongs
         whole, (row, col) = together(looks, best)
