@@ -12,8 +12,8 @@ PY := $(VENV)/bin/python
 PIP := $(PY) -m pip --disable-pip-version-check
 INSTALLED := $(VENV)/.installed
 ORACLES := .venv-oracles
-# BLAS threads beside JOBS processes would only wait for each other.
-PYTEST := OPENBLAS_NUM_THREADS=1 $(PY) -m pytest -n $(JOBS) --dist loadfile --hypothesis-seed=0
+# BLAS threads beside JOBS processes would only wait for each other. Bytecode is kept: every process that a test starts would compile anew.
+PYTEST := PYTHONDONTWRITEBYTECODE= OPENBLAS_NUM_THREADS=1 $(PY) -m pytest -n $(JOBS) --dist loadfile --hypothesis-seed=0
 QUICK := $(PYTEST) -m "not browser and not oracle" --durations=15 --durations-min=5
 
 .DEFAULT_GOAL := help
