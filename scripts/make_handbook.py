@@ -17,7 +17,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "docs"))  # the gallery is no part of the package
 
 from gallery import questions  # noqa: E402
-from gallery.pages import NOTES, ORDER, write  # noqa: E402
+from gallery.pages import ORDER, write  # noqa: E402
 
 TARGET = Path(__file__).resolve().parents[1] / "docs" / "handbook"
 
@@ -38,7 +38,7 @@ def main() -> None:
     twice, names = "--twice" in sys.argv[1:], [name for name in sys.argv[1:] if name != "--twice"]
     if unknown := set(names) - set(known):
         sys.exit(f"no such page: {', '.join(sorted(unknown))}; there are {', '.join(known)}")
-    run = names or (*NOTES, questions.NAME)
+    run = names or known
     if twice:
         sys.exit(f"two runs differ: {', '.join(wrong)}" if (wrong := made_twice(run)) else 0)
     for path in write(TARGET, run):

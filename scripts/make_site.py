@@ -21,7 +21,7 @@ import pixmetry
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "docs"))  # the site's pages are no part of the package
 
-from gallery import questions  # noqa: E402
+from gallery import questions, shorts  # noqa: E402
 from gallery.note import Note, stored_numbers  # noqa: E402
 from gallery.notebooks import notebook_of  # noqa: E402
 from gallery.pages import NOTES, ORDER  # noqa: E402
@@ -108,8 +108,8 @@ def stage(folder: Path) -> None:
 def write_notebooks(folder: Path) -> None:
     """Write a notebook beside each page of the handbook that has a script, and name it on the page."""
     numbers = stored_numbers()
-    for name in NOTES:
-        note = Note.read(name)
+    for name in ORDER:
+        note = Note.read(name) if name in NOTES else shorts.note_of(name)
         pictures = [(folder / f"{figure}.svg").read_text(encoding="utf-8") for figure in note.figures]
         (folder / f"{name}.ipynb").write_text(json.dumps(notebook_of(note, numbers[name], pictures), indent=1, ensure_ascii=False) + "\n")
         page = folder / f"{name}.md"

@@ -9,7 +9,7 @@ from types import ModuleType
 import pytest
 from gallery.note import Note, stored_numbers
 from gallery.notebooks import notebook_of
-from gallery.pages import NOTES
+from gallery.pages import NOTES, ORDER
 from site_pages import source_pages
 
 import pixmetry
@@ -35,7 +35,7 @@ def test_all_pages_are_there_and_linked(maker: ModuleType, tmp_path: Path, monke
     assert {p.stem for p in (pages / "sources").glob("*.md")} == {"index", *sources()}
     shown = {p.stem.rpartition("-")[0] for p in (pages / "api").glob("*.rst")}
     assert shown == {name.lower() for name in pixmetry.__all__ if not name.startswith("_")}
-    assert {p.stem for p in (pages / "handbook").glob("*.ipynb")} == set(NOTES)
+    assert {p.stem for p in (pages / "handbook").glob("*.ipynb")} == set(ORDER)
     wrong = {p.name: links for p in pages.rglob("*.md") if (links := broken(p, p.read_text(encoding="utf-8")))}
     assert not wrong
 

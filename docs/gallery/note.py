@@ -80,7 +80,7 @@ class Note:
 
     def page(self, numbers: dict[str, float], pictures: tuple[Figure, ...] = ()) -> Page:
         """Put the numbers into the text."""
-        shown = {f"figure_{k}": self._picture(k, told, numbers) for k, told in self.head.get("figures", {}).items()}
+        shown = {f"figure_{k}": self.picture(k, told, numbers) for k, told in self.head.get("figures", {}).items()}
         text = self._fill(self.body, {**numbers, **shown, "items": comparison(self.items(numbers))})
         title = f"# {self.head['title']} ({self.head['chapter']})\n\n"
         script = f"## The script\n\n`docs/gallery/notes/{self.name.replace('-', '_')}.py`\n\n```python\n{self.script}```\n"
@@ -97,7 +97,8 @@ class Note:
             told["tolerance"] = float(f"{3 * u:.3g}")
         return Item.judged(**told, ours=numbers[name], u=u)
 
-    def _picture(self, name: str, told: dict[str, str], numbers: dict[str, float]) -> str:
+    def picture(self, name: str, told: dict[str, str], numbers: dict[str, float]) -> str:
+        """A figure and its caption."""
         alt, caption = (self._fill(told[part], numbers) for part in ("alt", "caption"))
         return f'<img src="{name}.svg" width="{WIDTH_PX}" alt="{escape(alt)}">\n\n*{caption}*\n'
 

@@ -7,7 +7,7 @@ from collections.abc import Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from gallery import error_table_page, line_jitter_page, offset_page, questions, threshold_page
+from gallery import error_table_page, line_jitter_page, offset_page, questions, shorts, threshold_page
 from gallery.chapter import list_of_all
 from gallery.item import KINDS, Item, comparison
 from gallery.note import Note, record_of, stored_numbers
@@ -38,9 +38,9 @@ within the tolerance of that; the page tells why the others do not. {count}
 The same table, with the reasons, is in [gallery.json](gallery.json).
 
 {items}
-`make handbook` writes these pages; `make handbook ONLY="sampling-clock"` writes some of them. Most pages are a script of at most 60 lines,
-which stands on the page, and take less than a minute. The experiment on line jitter takes minutes; `benchmarks/study_line_jitter.py` runs
-it and stores its numbers.
+`make handbook` writes these pages; `make handbook ONLY="sampling-clock"` writes some of them. On every page stands a script of at most 60
+lines, which takes less than a minute. Four pages (thresholds, black below zero, line jitter, the error table) go further than their
+script. The experiment on line jitter takes minutes; `benchmarks/study_line_jitter.py` runs it and stores its numbers.
 """
 
 EXPERIMENTS = {  # pages with modules of their own: where in the chapter, title, what it shows
@@ -93,7 +93,9 @@ def make_gallery(run: Collection[str] = NOTES) -> Gallery:
         if name in EXPERIMENTS:
             module, where, title, what = EXPERIMENTS[name]
             own, made = module.items(), module.page()
-            pages[name] = replace(made, text=f"{made.text.rstrip()}\n\n## Chapter, ours, and why they differ\n\n{comparison(own)}")
+            numbers[name], drawn = shorts.note_of(name).run() if name in run or name not in numbers else (numbers[name], ())
+            told = f"## Chapter, ours, and why they differ\n\n{comparison(own)}\n{shorts.section(name, numbers[name])}"
+            pages[name] = replace(made, text=f"{made.text.rstrip()}\n\n{told}", pictures=(*made.pictures, *drawn))
             items += [(name, item) for item in own]
         else:
             note = Note.read(name)
@@ -113,7 +115,7 @@ def make_gallery(run: Collection[str] = NOTES) -> Gallery:
         count=_count([item for _, item in items]),
     )
     found = [item for _, item in items]
-    kept = {name: numbers[name] for name in (*NOTES, asked)}
+    kept = {name: numbers[name] for name in (*ORDER, asked)}
     return Gallery({"index": Page("index", index), **pages}, tuple(found), record_of(found, kept))
 
 

@@ -9,7 +9,7 @@ import xml.etree.ElementTree as ET
 from pathlib import Path
 
 import pytest
-from gallery import questions
+from gallery import questions, shorts
 from gallery.chapter import ENTRIES, entry_of
 from gallery.chapter import NOTES as CHAPTER_NOTES
 from gallery.item import KINDS, REASONS, Item
@@ -90,9 +90,9 @@ def test_every_verdict_is_one_of_three_and_says_why(gallery: Gallery) -> None:
             )
 
 
-@pytest.mark.parametrize("name", NOTES)
+@pytest.mark.parametrize("name", ORDER)
 def test_a_script_is_short_and_takes_only_what_a_user_has(name: str) -> None:
-    script = Note.read(name).script
+    script = (Note.read(name) if name in NOTES else shorts.note_of(name)).script
     assert len(script.splitlines()) <= MOST_LINES
     imported = set(re.findall(r"^\s*(?:from|import) (\w+)", script, flags=re.M))
     assert imported <= {"numpy", "pixmetry", "matplotlib", *sys.stdlib_module_names} and not re.search(r"pixmetry[\w.]*\._", script)
@@ -107,8 +107,25 @@ def test_one_number_changed_in_a_script_gives_the_answer_that_the_page_tells() -
         assert any(told[questions.NAME][f"{k}_{name}"] != told[question.page][name] for name in question.shown), question.ask
 
 
+def test_the_short_scripts_give_the_numbers_of_their_pages() -> None:
+    """Threshold: 800 other targets with standard errors of 2.5 %, so 15 % is four of the difference; the offset's are exact."""
+    from gallery import error_table_page, offset, threshold
+
+    told = json.loads(STORED.read_text(encoding="utf-8"))["numbers"]
+    noisy, at = threshold.sweep(threshold.DISC).noisy, threshold.THRESHOLDS_DN.tolist().index(25.0)
+    for name, curve in (("hard_25", "centroid"), ("squared_25", "squared centroid"), ("soft_25", "soft centroid")):
+        assert told["threshold"][name] == pytest.approx(noisy[curve].rms_px[at], rel=0.15)
+    for conversion, name in (("unquantised", "unrounded"), ("rounded", "rounded"), ("truncated", "truncated")):
+        found = offset.swing(offset.OFFSET_DN, conversion)
+        assert told["offset"][f"rms_{name}"] == pytest.approx(found.rms_px, rel=1e-4)
+        assert told["offset"][f"first_{name}"] == pytest.approx(abs(found.first_px), rel=1e-4)
+    assert told["error-table"]["chapter_x"] == pytest.approx(error_table_page.chapter_budget().one.after_px[0], rel=1e-3)
+    assert told["line-jitter"]["told_ns_5"] == pytest.approx(5.0, rel=0.1)  # 2 % by 1380 rows, 3 % by the response
+
+
 def test_there_are_no_other_files(pages: dict[str, Page]) -> None:
     figures = {f"{figure}.svg" for name in NOTES for figure in Note.read(name).figures}
+    figures |= {f"{name}-script.svg" for name in shorts.SHORTS}
     wanted = {name for page in pages.values() for name in page.files()} | figures | {STORED.name}
     assert {path.name for path in FOLDER.iterdir()} == wanted
 
