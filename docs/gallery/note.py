@@ -83,7 +83,7 @@ class Note:
         shown = {f"figure_{k}": self.picture(k, told, numbers) for k, told in self.head.get("figures", {}).items()}
         text = self._fill(self.body, {**numbers, **shown, "items": comparison(self.items(numbers))})
         title = f"# {self.head['title']} ({self.head['chapter']})\n\n"
-        script = f"## The script\n\n`docs/gallery/notes/{self.name.replace('-', '_')}.py`\n\n```python\n{self.script}```\n"
+        script = f"## The script\n\n{how_to_run(self.name)}\n\n```python\n{self.script}```\n"
         return Page(self.name, f"{title}{text}\n{script}", pictures)
 
     def _item(self, told: dict[str, Any], numbers: dict[str, float]) -> Item:
@@ -105,6 +105,13 @@ class Note:
     def _fill(self, text: str, numbers: dict[str, Any]) -> str:
         signed = {name: Signed(value) if isinstance(value, float) else value for name, value in numbers.items()}
         return text.format_map(signed).strip("\n") if "\n" not in text.strip("\n") else text.format_map(signed)
+
+
+def how_to_run(name: str) -> str:
+    """Where the script of a page is, and how to see its numbers."""
+    module = name.replace("-", "_")
+    command = f'python -c "import {module}; [print(*number) for number in {module}.run()[0].items()]"'
+    return f"`docs/gallery/notes/{module}.py`. Copy it into a folder, change a number, and print what it gives:\n\n```sh\n{command}\n```"
 
 
 class Signed(float):

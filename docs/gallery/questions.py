@@ -11,7 +11,8 @@ from pixmetry.core.errors import InputError
 NAME = "questions"
 TEXT = """# Questions that one number answers
 
-Each page of the handbook has its script, as text and as a notebook. Change one number in it, run it again, and see.
+Each page of the handbook has its script, as text and as a notebook. Change one number in it, run it again, and see: copy the script into a
+file, and print its numbers with the command that stands above it; or open the notebook and run all cells.
 Here are five questions, and what comes out.
 
 """

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from gallery.item import number
-from gallery.note import MOST_LINES, NOTES, Note
+from gallery.note import MOST_LINES, NOTES, Note, how_to_run
 from gallery.page import table
 from pixmetry.core.errors import InputError
 
@@ -77,8 +77,7 @@ def section(name: str, numbers: dict[str, float]) -> str:
     note, short = note_of(name), SHORTS[name]
     rows = [[what, number(numbers[key])] for key, what in short.told.items()]
     figure = note.picture(f"{name}-script", note.head["figures"][f"{name}-script"], numbers)
-    file = f"docs/gallery/notes/{name.replace('-', '_')}.py"
     return (
-        f"## The script\n\n`{file}`: the heart of the experiment, to change and run again. It gives\n\n"
+        f"## The script\n\nThe heart of the experiment, to change and run again.\n{how_to_run(name)}\n\nIt gives\n\n"
         f"{table(['', 'the script'], rows)}\n{figure}\n```python\n{note.script}```\n"
     )
