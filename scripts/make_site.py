@@ -37,7 +37,7 @@ SECTIONS = {  # of the site, and the pages of each; a page that stands in none s
     "Budget and simulate": ["budget", "bench", "data-sheets", "cameras", "scenes", "simulate"],
     "Handbook": ["handbook/index"],
     "Reference": ["sources/index", "api/index", "glossary", "conventions", "files"],
-    "Develop": ["architecture", "adding-a-source", "decisions", "contributing", "changes"],
+    "Develop": ["architecture", "adding-a-source", "decisions", "contributing", "releases", "changes"],
 }
 CONF: dict[str, Any] = {
     "project": "pixmetry",
