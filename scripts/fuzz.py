@@ -119,7 +119,8 @@ def _pillow(raw: bytes) -> np.ndarray | None:
     with Image.open(io.BytesIO(raw)) as image:
         if image.mode not in ("L", "I;16", "I;16B") or getattr(image, "n_frames", 1) > 1 or image.info.get("transparency") is not None:
             return None
-        if image.format == "TIFF" and image.mode != "L" and image.tag_v2.get(262) == 0:  # Pillow leaves 16-bit WhiteIsZero as it is
+        # Pillow leaves 16-bit WhiteIsZero as it is, and takes 0 as white where nothing is said.
+        if image.format == "TIFF" and (262 not in image.tag_v2 or (image.mode != "L" and image.tag_v2[262] == 0)):
             return None
         image.load()
         return np.asarray(image)

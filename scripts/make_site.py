@@ -50,7 +50,7 @@ CONF: dict[str, Any] = {
         "header_links_before_dropdown": 8,
         "show_nav_level": 1,
         "navigation_with_keys": False,
-        "secondary_sidebar_items": {"**": ["page-toc"], "handbook/*": []},  # wide tables
+        "secondary_sidebar_items": ["page-toc"],
     },
     "html_static_path": ["_static"],
     "html_css_files": ["site.css"],

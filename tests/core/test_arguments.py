@@ -70,6 +70,7 @@ def example(
 def test_what_the_annotations_say_is_taken() -> None:
     assert example(2, np.int64(3), text="x", place=Path("a"), some=["a"], pair=(2, "b"), word="b", settings={"a": object()}) == 6
     assert example(np.float32(0.5), 2.0, array=np.zeros(3), flag=np.bool_(True), some=("a", "b")) == 1.0  # type: ignore[arg-type]
+    assert example(1, some=np.array(["a", "b"])) == 1.0
     assert example(float("inf")) == float("inf")
     assert example.__doc__ == "All that can be annotated."
     with pytest.raises(TypeError):  # a wrong call is a mistake in the program

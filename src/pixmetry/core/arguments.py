@@ -185,9 +185,10 @@ def _is_one(value: Any, kind: ast.expr, known: Mapping[str, Any]) -> bool:
 
 
 def _is_collection(value: Any, kind: ast.expr, name: str, known: Mapping[str, Any]) -> bool:
-    if isinstance(value, str | bytes) or not isinstance(value, CONTAINERS[name]):
+    of_numpy = isinstance(value, np.ndarray) and value.ndim > 0 and name in ("Sequence", "Iterable")
+    if isinstance(value, str | bytes) or not (of_numpy or isinstance(value, CONTAINERS[name])):
         return False
-    if not isinstance(kind, ast.Subscript) or not isinstance(value, Collection) or isinstance(value, np.ndarray):
+    if not isinstance(kind, ast.Subscript) or not isinstance(value, Collection):
         return True
     inner = list(kind.slice.elts) if isinstance(kind.slice, ast.Tuple) else [kind.slice]
     if name in ("Mapping", "dict"):

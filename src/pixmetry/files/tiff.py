@@ -156,9 +156,8 @@ def _page(page: Any, size: int) -> TiffPage:
         raise ValueError(f"values of {page.bitspersample} bits, sample format {page.sampleformat}, in {page.shaped[2:4]} pixels")
     if page.shaped[1] > 1:
         raise InputError("TIFF of a volume", allowed="images of one plane", remedy="store its planes as pages")
-    if 262 not in page.tags:  # without it a reader must guess whether white is high
-        raise ValueError("it does not say whether white is high or low (PhotometricInterpretation)")
-    photometric = int(page.photometric)
+    # Some cameras' software leaves PhotometricInterpretation out. Then 0 is black, as libtiff and ImageJ take it; tifffile says white.
+    photometric = int(page.photometric) if 262 in page.tags else 3 if page.colormap is not None else 1 if page.shaped[4] < 3 else 2
     coder = int(page.compression)
     if photometric not in _READ or (photometric == 6 and coder not in _JPEG):
         what = f"TIFF of a photometric kind that is not read ({photometric})"
