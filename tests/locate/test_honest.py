@@ -122,6 +122,15 @@ def test_noise_before_a_coder_is_that_of_the_region_of_interest(rng: np.random.G
     assert noise_before(frame, coder, nothing) > 2.5
 
 
+@pytest.mark.parametrize("light", [0.006, 0.025])
+def test_light_that_falls_off_over_few_targets_of_a_coded_picture(light: float, rng: np.random.Generator) -> None:
+    """16 discs, fewer than tell a shared slope together: error over u is 1 to 15 % and chance. Without slopes it is 4 to 7."""
+    score = honest_cases.score(Picture(*honest_cases.discs(rng, 4, radius=9.0, light=light, height=120.0), coded(60)), rng, 1)
+    assert len(score.z) == 32
+    low, high = bounds(len(score.z))
+    assert low < np.sqrt((score.z**2).mean()) < high
+
+
 def test_a_coder_that_leaves_nothing_of_a_target_does_not_make_it_certain() -> None:
     """A spot of 3 DN, of which a JPEG of quality 20 leaves an even block wherever it lies: u was 1e-16 px, for nothing moves it."""
     v, u = np.indices((11, 11)) - 5.0

@@ -30,7 +30,7 @@ class Settings:
     shape : {"disc", "ellipse", "ring", "spot"}
         Of the template.
     planes : {"auto", "shared"} or bool
-        Whether slopes of the ground and of the light are among the unknowns; "shared": only where many targets have them.
+        Whether slopes of the ground and of the light are among the unknowns; "shared": only where many targets, or most, have them.
     light_on : {"surface", "image"}
         Whether light that falls off acts before the lens's blur or after it.
     aperture_px : float

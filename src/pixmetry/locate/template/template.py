@@ -113,8 +113,8 @@ def fit_template(
         variance (Huang et al. 2013). ``poisson_gaussian`` uses the exact likelihood (Snyder et al. 1995) where the mean is below 60
         electrons and the read noise below 3; it is the same as least squares where the noise does not depend on the level.
     background_plane, light_plane : {"auto", "shared"} or bool
-        A slope of the background, and of the light on the target, among the unknowns; see Notes. "shared": as "auto", but none that a
-        single target asks for, where what is in one place alone is no light: the waves of a coder.
+        A slope of the background, and of the light on the target, among the unknowns; see Notes. "shared": as "auto", but only where most
+        targets ask for one, or 20 that are judged together: what is in one place alone may be the wave of a coder, and no light.
         A spot knows no light plane: to first order it is a shift.
     light_on : {"surface", "image"}
         See `model`.
@@ -175,7 +175,8 @@ def fit_template(
             free = ground and background_plane == "auto", light and light_plane == "auto"  # the other one is wanted in any case
             if any(free):
                 there, other = predicted(windows, targets, result, again, (ground, light), threads)
-                there = there if single or there.all() and len(again) >= POOL else np.zeros_like(there)
+                if not (single or (there.all() if len(again) >= POOL else 2 * there.sum() > len(targets))):
+                    there = np.zeros_like(there)
                 on_ground[again[~there]], on_light[again[~there]] = other[0] or ground and not free[0], other[1] or light and not free[1]
                 again = again[there]
             if not len(again):
