@@ -414,6 +414,8 @@ def correct(
         raise InputError("a finer grid needs shifted frames", where="finer", value=finer, remedy="say how they are shifted (shifts)")
     layout = layout_of(raw)
     known = known_of(with_, dark=dark, flat=flat, defects=defects, settings=settings, only=only, skip=skip, raw=layout)
+    if shifts is not None:
+        _check_pixels(known)
     if isinstance(frames, np.ndarray):
         made = _correct_array(frames, known, sequence)
         return made if shifts is None else _put_together(made, known, shifts, finer)
@@ -706,6 +708,21 @@ def _correct_array(frames: np.ndarray, known: Known, sequence: bool = False) -> 
         out[i] = corrected.data[0]
         said.append(factors.told(name, steps))
     return Correction(_together(said), out, steps=said[shown] if said else (), clipped=clipped, clipped_pixels=int(clipped.sum()))
+
+
+def _check_pixels(known: Known) -> None:
+    """Refuse a finer grid of values that are no pixels of the sensor: it undoes the light-sensitive area of one pixel."""
+    camera, where = known.camera, "shifts"
+    mosaic = next((e.name for e in camera.active if e.source.id in HIDDEN_BY), None)
+    if mosaic is not None:
+        raise InputError("neighbouring pixels have colours of their own", where=where, value=mosaic, allowed="a camera without a mosaic")
+    if not any(e.source.id == APERTURE for e in camera.active):
+        camera = with_source(replace(camera, chain=tuple(e for e in camera.chain if e.source.id != APERTURE)), APERTURE)
+    element = next(e for e in camera.active if e.source.id == APERTURE)
+    frame = _signal_of(np.zeros((1, *camera.output_shape), np.uint8), camera.output_shape, Kind.CODES, camera)
+    if _on_grid_of(camera, element, frame) is None:
+        remedy = "sample by the pixel clock, and store the rows of the sensor"
+        raise InputError("the stored pixels are not those of the sensor", where=where, value=camera.name, remedy=remedy)
 
 
 def _put_together(made: Correction, known: Known, shifts: Any, finer: Any) -> Correction:

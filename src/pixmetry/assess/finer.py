@@ -15,7 +15,9 @@ from pixmetry.camera.camera import Camera, Element
 from pixmetry.camera.finer_grid import FINER_KEY, MOST_FINER, SHIFT_KEY, ShiftedFrames, finest, lost_bands
 from pixmetry.camera.signal import Kind, Signal
 from pixmetry.core.config import read_text
+from pixmetry.core.door import one_sentence
 from pixmetry.core.errors import InputError
+from pixmetry.core.memory import check_memory
 from pixmetry.core.random import Grid
 from pixmetry.observe.frame_shifts import frame_shifts
 from pixmetry.sources.sensor.pixel_aperture import transfer
@@ -37,8 +39,8 @@ class FinerImage:
     finer : (int, int)
         Finer pixels in a pixel, along x and y.
     origin_px : (float, float)
-        Where the centre of its first pixel lies in the first frame, in pixels of the frame: finer pixel (i, j) is at
-        ``origin_px + (j / finer[0], i / finer[1])``, less the shift of that frame.
+        Where the centre of its first pixel lies in a frame whose shift is 0, in pixels of the frames: finer pixel (i, j) is at
+        ``origin_px + (j / finer[0], i / finer[1])`` there, and its shift farther in another frame.
     pitch_um : (float, float) or None
         Of the finer grid.
     shifts_px, u_shifts_px : ndarray, shape (n, 2)
@@ -121,7 +123,9 @@ def finer_image(frames_dn: np.ndarray, camera: Camera, shifts: Any, finer: Any =
         raise InputError("the shifts are not known well enough", where="shifts", value=value, allowed=allowed, remedy=remedy)
     grid = ShiftedFrames(shifts_px, steps, shape)
     grid.check()
-    n = len(frames_dn)
+    n, remedy = len(frames_dn), "ask for a coarser grid, or cut the frames"
+    complex_frames = 3 * n + 5 * steps[0] * steps[1]  # spectra, what is left of them and what is between; the finer ones
+    check_memory(16.0 * complex_frames * shape[0] * shape[1], f"a grid of {steps[0]} × {steps[1]} from {n} frames", remedy=remedy)
     signal = Signal(frames_dn, Kind.DN, Grid.whole([0] * n, shape), shape, np.ones(n), np.zeros(n), np.full(n, camera.temperature_c))
     image = source.correct(params, signal, {SHIFT_KEY: shifts_px, FINER_KEY: np.array(steps)}).data[0]
     _, residual = grid.restored(frames_dn, lambda fx, fy: transfer(params, fx, fy)) if n > steps[0] * steps[1] else (None, float("nan"))
@@ -166,8 +170,8 @@ def _pair(finer: Any) -> tuple[int, int]:
     """Steps along x and y from a number, two, or text: ``4``, ``4x1``."""
     try:
         parts = finer.lower().split("x") if isinstance(finer, str) else np.atleast_1d(finer).tolist()
-        values = tuple(int(v) for v in parts)
-    except (TypeError, ValueError):
+        values = tuple(int(v) for v in parts if isinstance(v, str) or v == int(v))
+    except (TypeError, ValueError, OverflowError):
         values = ()
     if len(values) == 1:
         values = values * 2
@@ -181,7 +185,11 @@ def _shifts_of(shifts: Any, frames_dn: np.ndarray) -> tuple[np.ndarray, np.ndarr
     if isinstance(shifts, str) and shifts == FOUND:
         found = frame_shifts(frames_dn)
         return found.shifts_px, found.u_px
-    told, u = read_shifts(shifts) if isinstance(shifts, str | Path) else (np.asarray(shifts, float), None)
+    if isinstance(shifts, str | Path):
+        told, u = read_shifts(shifts)
+    else:
+        with one_sentence("no shifts", "shifts", allowed=f"a table, {FOUND!r}, or numbers of shape (n, 2)", remedy="check the argument"):
+            told, u = np.asarray(shifts, float), None
     if told.shape != (len(frames_dn), 2) or not np.isfinite(told).all():
         raise InputError("a shift along x and y is needed for every frame", where="shifts", value=f"shape {told.shape}",
                          allowed=f"({len(frames_dn)}, 2), finite")  # fmt: skip
@@ -201,4 +209,6 @@ def read_shifts(path: str | Path) -> tuple[np.ndarray, np.ndarray | None]:
         u = np.array([[float(row["u_shift_px"])] * 2 for row in rows]) if "u_shift_px" in rows[0] else None
     except (TypeError, ValueError):
         raise InputError("a shift is not a number", where=str(path), allowed="numbers, in pixels of the frames") from None
+    if u is not None and not (np.isfinite(u) & (u >= 0)).all():
+        raise InputError("a u of a shift is no uncertainty", where=str(path), allowed="0 or more, in pixels of the frames")
     return told, u

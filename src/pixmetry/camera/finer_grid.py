@@ -135,11 +135,7 @@ class ShiftedFrames:
             Standard deviation of the residuals in a pixel; NaN where there are no more frames than needed.
         """
         self.check()
-        (mx, my), (rows, cols), level = self.finer, self.frame_shape, float(np.mean(frames))
-        low = []
-        for m, n in ((mx, cols), (my, rows)):
-            base = np.arange(n) / n
-            low.append(base - m // 2 - (np.where(base < 0.5, 0, 1) if m % 2 else 0))  # the lowest of the frequencies that fold to one
+        (mx, my), (rows, cols), level, low = self.finer, self.frame_shape, float(np.mean(frames)), self._lowest
         spectra = np.empty((len(frames), rows, cols), complex)
         for k, (frame, (sx, sy)) in enumerate(zip(frames, self.shifts_px, strict=True)):
             fade = np.outer(self._fade(np.arange(rows) - sy, 1), self._fade(np.arange(cols) - sx, 0))
@@ -153,24 +149,38 @@ class ShiftedFrames:
             weight = sum(np.mean(self._fade(np.arange(rows) - s[1], 1) ** 2) * np.mean(self._fade(np.arange(cols) - s[0], 0) ** 2)
                          for s in self.shifts_px) / len(frames)  # fmt: skip
             left = float(np.sqrt(np.mean(np.abs(rest) ** 2) / (rows * cols * weight) * len(frames) / spare))
-        whole = np.zeros((my * rows, mx * cols), complex)
-        for index, part in enumerate(parted):
-            parts = [np.rint((lo + step) * n).astype(int) % (m * n)
-                     for lo, step, n, m in ((low[1], index // mx, rows, my), (low[0], index % mx, cols, mx))]  # fmt: skip
-            whole[np.ix_(*parts)] = part
+        whole = self._in_order(parted)
         fx, fy = self.frequencies()
         gain = self._gain(transfer)
         start = [(1 / m - 1) / 2 for m in self.finer]  # of the first finer pixel in the pixel 0
         gain = gain * np.exp(2j * np.pi * fy * start[1])[:, None] * np.exp(2j * np.pi * fx * start[0])
         image = np.real(np.fft.ifft2(whole * gain)) * mx * my + level
         a = self.area
-        return image[a.row0 * my : (a.row0 + a.rows) * my, a.col0 * mx : (a.col0 + a.cols) * mx], left
+        # places of the image lie beyond the frame where all shifts have an offset; the spectrum repeats them after a frame's size
+        at_y, at_x = my * a.row0 + np.arange(my * a.rows), mx * a.col0 + np.arange(mx * a.cols)
+        return image.take(at_y, 0, mode="wrap").take(at_x, 1, mode="wrap"), left
 
     def noise_rel(self, transfer: Transfer) -> float:
         """Standard deviation of a finer pixel over that of a pixel of one frame, by white noise."""
-        (mx, my) = self.finer
-        power = np.mean(np.abs(self._gain(transfer)) ** 2)  # the parted frequencies are equally uncertain on average
-        return float(np.sqrt(power * self._covariance.mean() * mx * my))
+        power = np.abs(self._gain(transfer)) ** 2 * self._in_order(self._covariance[:, None, None])
+        return float(np.sqrt(np.mean(power) * self.finer[0] * self.finer[1]))
+
+    @property
+    def _lowest(self) -> tuple[np.ndarray, np.ndarray]:
+        """Of the frequencies along x and along y that fold to one, the lowest."""
+        bases = [(m, np.arange(n) / n) for m, n in zip(self.finer, self.frame_shape[::-1], strict=True)]
+        x, y = (base - m // 2 - (np.where(base < 0.5, 0, 1) if m % 2 else 0) for m, base in bases)
+        return x, y
+
+    def _in_order(self, parted: np.ndarray) -> np.ndarray:
+        """Parted frequencies, shape (frequencies, rows, cols), where they stand in the finer spectrum."""
+        (mx, my), (rows, cols), low = self.finer, self.frame_shape, self._lowest
+        whole = np.zeros((my * rows, mx * cols), parted.dtype)
+        for index, part in enumerate(parted):
+            parts = [np.rint((lo + step) * n).astype(int) % (m * n)
+                     for lo, step, n, m in ((low[1], index // mx, rows, my), (low[0], index % mx, cols, mx))]  # fmt: skip
+            whole[np.ix_(*parts)] = part
+        return whole
 
     def _gain(self, transfer: Transfer) -> np.ndarray:
         """Of the restored spectrum: from the aperture of a pixel to that of the finer pixel."""

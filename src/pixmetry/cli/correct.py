@@ -106,7 +106,8 @@ def correct(
     if correction.finer is not None:
         (x, y), pitch = correction.finer.origin_px, correction.finer.pitch_um
         size = "" if pitch is None else f", pitch {pitch[0]:.4g} × {pitch[1]:.4g} µm"
-        echo(f"the first finer pixel lies at x {x:.4g}, y {y:.4g} px of the frames{size}; camera.yaml has its size, pitch and noise")
+        at = f"x {x:.4g}, y {y:.4g} px of a frame that is not shifted{size}"
+        echo(f"the first finer pixel lies at {at}; camera.yaml has its size, pitch and noise")
     echo(f"corrected frames: {output}")
 
 
