@@ -159,6 +159,42 @@ def test_another_capture_is_not_gone_on_with(rng: np.random.Generator, tmp_path:
         capture(other, edge(2), tmp_path / "shots", Obedient(other), full_s=FULL_S)
 
 
+def test_files_that_no_capture_wrote_stay_as_they_are(rng: np.random.Generator, tmp_path: Path) -> None:
+    camera = LiveDouble(rng)
+    for name in ("campaign.yaml", "frames/edge_01_0001.tif", "frames/mine.tif"):
+        own = tmp_path / name.replace("/", "_") / name
+        own.parent.mkdir(parents=True)
+        own.write_bytes(b"mine")
+        folder = tmp_path / name.replace("/", "_")
+        with pytest.raises(InputError, match="not from a capture"):
+            capture(camera, edge(2), folder, Obedient(camera), full_s=FULL_S)
+        assert [path for path in folder.rglob("*") if path.is_file()] == [own] and own.read_bytes() == b"mine"
+    capture(camera, edge(2), tmp_path / "shots", Obedient(camera), full_s=FULL_S)
+    added = [tmp_path / "shots" / "frames" / name for name in ("notes.txt", "edge_01_0001_cut.tif", "other_01_0001.tif")]
+    for path in added:
+        path.write_bytes(b"mine")
+    capture(camera, edge(2), tmp_path / "shots", Obedient(camera), full_s=FULL_S)
+    assert all(path.read_bytes() == b"mine" for path in added)
+
+
+def test_a_capture_goes_on_with_frames_of_the_same_size_and_one_clock(rng: np.random.Generator, tmp_path: Path) -> None:
+    """A second run of a camera whose window was changed, and whose clock began anew."""
+    step = [Step(1, "series", "series", "The chart.", "series", 6, light=0.5)]
+
+    def stops(sent: int) -> None:
+        if sent == 4:
+            raise KeyboardInterrupt
+
+    first, second = LiveDouble(rng), LiveDouble(rng, {1: "short"})
+    first.after = stops
+    with pytest.raises(KeyboardInterrupt):
+        capture(first, step, tmp_path / "s", Obedient(first), full_s=FULL_S)
+    found = capture(second, step, tmp_path / "s", Obedient(second), full_s=FULL_S)
+    assert found.faults == {"damaged": 1}
+    (group,) = load_campaign(found.manifest).groups
+    assert len(group.facts.times_s) == 6 and np.all(np.diff(group.facts.times_s) > 0)
+
+
 def test_a_camera_that_is_silent_or_broken_is_given_up(rng: np.random.Generator, tmp_path: Path) -> None:
     for name, fault, words in (("a", "silent", "sends no frames"), ("b", "incomplete", "missed, damaged or doubled")):
         camera = LiveDouble(rng, dict.fromkeys(range(4, 10_000), fault))

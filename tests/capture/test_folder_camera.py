@@ -80,6 +80,17 @@ def test_frames_with_another_exposure_time_do_not_count(rng: np.random.Generator
     assert found.frames == 4 and found.faults == {"damaged": 1}
 
 
+def test_exposure_times_at_the_end_of_names_count_no_frames(
+    rng: np.random.Generator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    raw = [stored(tmp_path, rng.integers(100, 3000, SHAPE).astype(np.uint16)) for _ in range(4)]
+    (tmp_path / "in").mkdir()
+    camera = FolderCamera(tmp_path / "in", 12)
+    files = [(f"img_{k:04d}_10ms.tif", raw[k]) for k in (0, 1, 3)]
+    found = capture(camera, steps(3), tmp_path / "shots", Recorder(camera, files, monkeypatch), full_s=0.02)
+    assert found.frames == 3 and found.faults == {"missed": 1}
+
+
 def test_a_file_that_is_being_written_is_waited_for(rng: np.random.Generator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     frame = rng.integers(100, 3000, SHAPE).astype(np.uint16)
     raw = stored(tmp_path, frame)

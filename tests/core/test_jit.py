@@ -336,6 +336,15 @@ def test_cache_folder_falls_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert root.parent == tmp_path and root.stat().st_mode & 0o022 == 0
 
 
+def test_a_user_without_a_home_gets_a_temporary_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("PIXMETRY_CACHE_DIR", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(os.path, "expanduser", lambda path: path)  # what it does where there is none
+    monkeypatch.setattr(module.tempfile, "gettempdir", lambda: str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    assert module._cache_root().parent == tmp_path and not (tmp_path / "~").exists()
+
+
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="no owners of files")
 def test_compiled_code_that_others_may_have_written_is_not_executed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     own, others = tmp_path / "own", tmp_path / "others"

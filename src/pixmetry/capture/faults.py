@@ -88,8 +88,10 @@ class Watch:
             return f"no grey image of whole numbers: {array.dtype}, {' x '.join(map(str, array.shape))}"
         if self.shape is not None and array.shape != self.shape:
             return f"{array.shape[1]} x {array.shape[0]} pixels in place of {self.shape[1]} x {self.shape[0]}"
-        if array.size == 0 or int(array.max()) >> self.bits:
-            return f"values beyond {self.bits} bits" if array.size else "no pixels"
+        if array.size == 0:
+            return "no pixels"
+        if int(array.min()) < 0 or int(array.max()) >> self.bits:
+            return f"values beyond {self.bits} bits"
         told = frame.exposure_s
         if told is not None and self.exposure_s and abs(told - self.exposure_s) > OTHER_EXPOSURE_REL * self.exposure_s:
             return f"exposed {told:g} s in place of {self.exposure_s:g} s"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import time
 from pathlib import Path
 from typing import Any
@@ -13,17 +12,15 @@ from pixmetry.files.files import natural
 from pixmetry.files.formats import PICTURE_ENDINGS, frames_of
 from pixmetry.files.images import load_picture
 from pixmetry.files.raw_values import RawLayout
-from pixmetry.files.told import joined, told_by_file, told_by_name
+from pixmetry.files.told import counter_of, joined, told_by_file, told_by_name
 
 LOOK_S = 0.05  # from one look into the folder to the next
 SETTLED_S = 0.3  # a file that has not changed for so long has been written
 DAMAGED_S = 2.0  # one that cannot be read after so long never will be
-_NUMBER = re.compile(r"(\d+)(?!.*\d)")
 
 
 def _order(path: Path) -> tuple[int, Any]:
-    found = _NUMBER.search(path.stem)
-    return int(found[1]) if found else 0, natural(path)
+    return counter_of(path.stem) or 0, natural(path)
 
 
 class FolderCamera:
@@ -41,7 +38,7 @@ class FolderCamera:
 
     Notes
     -----
-    The last number in a name is the counter of the frames; they come in its order. Files that are there when a
+    The last number in a name that is no exposure time is the counter of the frames; they come in its order. Files that are there when a
     run is started belong to no run. A file that cannot be decoded counts as damaged when it has not changed for two seconds.
     """
 
@@ -112,14 +109,14 @@ class FolderCamera:
             return
 
     def _read(self, path: Path, written_s: float) -> list[Grabbed]:
-        found = _NUMBER.search(path.stem)
+        counted = counter_of(path.stem)
         try:
             parts = frames_of(path, self.raw)
-            number = int(found[1]) if found and len(parts) == 1 else None
+            number = counted if len(parts) == 1 else None
             told = joined(told_by_file(path), told_by_name(path.name))
             time_s = told.taken_s if told.taken_s is not None else written_s
             return [
                 Grabbed(load_picture(part, None, self.raw).array, number, time_s, told.temperature_c, told.exposure_s) for part in parts
             ]
         except InputError as problem:
-            return [Grabbed(None, int(found[1]) if found else None, written_s, complete=False, why=problem.what)]
+            return [Grabbed(None, counted, written_s, complete=False, why=problem.what)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -16,7 +17,7 @@ from pixmetry.camera.group_facts import GroupFacts
 from pixmetry.capture.camera import Grabbed, LiveCamera
 from pixmetry.capture.faults import DAMAGED, DOUBLED, GOOD, MISSED, Watch
 from pixmetry.capture.levels import GroupLevels, Level
-from pixmetry.capture.log import CaptureLog
+from pixmetry.capture.log import NAME, CaptureLog
 from pixmetry.capture.plan import FROM_STAMPS, LONGEST_S, Step
 from pixmetry.capture.records import Captured, Reached, TakenStep
 from pixmetry.core.errors import InputError, MeasureError
@@ -130,14 +131,16 @@ class _Run:
             raise InputError("this camera's exposure is set by hand", where=camera.name, remedy=remedy)
         self.camera, self.steps, self.folder, self.operator = camera, steps, folder, operator
         self.factor, self.full_s, self.facts, self.progress, self.tell = factor, full_s, facts, progress, tell
+        self.frames = folder / FRAMES
+        self._check_folder()
         name = {"name": camera.name, "serial_number": camera.serial_number, "bits": camera.bits}
         head = {"camera": name, "u_factor": factor, "full_s": full_s, "facts": facts, "steps": [step.to_record() for step in steps]}
         self.log = CaptureLog(folder, head)
-        self.frames = folder / FRAMES
         self.frames.mkdir(exist_ok=True)
         self._remove_unnoted()
         self.levels: dict[int, GroupLevels] = {}
-        self.shape: tuple[int, int] | None = None
+        first = next((record["frame"] for records in self.log.frames.values() for record in records), None)
+        self.shape: tuple[int, int] | None = None if first is None else _pixels(self.frames / first).shape  # type: ignore[assignment]
         self.place = ""
         self.written_s = -math.inf
         self.reached: tuple[Reached, ...] = ()
@@ -147,11 +150,22 @@ class _Run:
         self.write_manifest()
         self.log.close()
 
+    def _check_folder(self) -> None:
+        """Begin no capture among files that no capture has written."""
+        if (self.folder / NAME).exists():
+            return
+        manifest = self.folder / MANIFEST
+        found = manifest if manifest.exists() else next(self.frames.iterdir(), None) if self.frames.is_dir() else None
+        if found is not None:
+            raise InputError("is there already, and not from a capture", where=str(found), remedy="choose another folder")
+
     def _remove_unnoted(self) -> None:
-        """Remove the frame that was in flight when a run was killed: it is not in the log."""
+        """Remove the frame that was in flight when a run was killed: it is not in the log. Other files stay."""
         noted = {record["frame"] for records in self.log.frames.values() for record in records}
+        names = "|".join(re.escape(step.name) for step in self.steps)
+        own = re.compile(rf"(\.)?({names})_\d{{4,}}(?(1)\.partial)\.tif")
         for path in self.frames.iterdir():
-            if path.name not in noted:
+            if own.fullmatch(path.name) and path.name not in noted:
                 path.unlink()
 
     # ---- what is taken -----------------------------------------------------------------------------------------------------------------
@@ -383,7 +397,7 @@ class _Run:
         records, known = self.log.frames[step.number], self.log.facts[step.number]
         stated: dict[str, Any] = {**step.facts, **{key: known[key] for key in step.asked if key in known and key != "exposure_s"}}
         if step.kind in FROM_STAMPS:
-            stamps = [r["time_s"] if r["time_s"] is not None else r["arrived_s"] for r in records]
+            stamps = _times_s(records)
             stated["times_s"] = tuple(round(t - stamps[0], 6) for t in stamps)
             temperatures = [r["temperature_c"] for r in records]
             if step.kind == "series" and all(t is not None for t in temperatures):
@@ -405,6 +419,14 @@ class _Run:
             for s in self.steps
         )
         return Captured(self.folder / MANIFEST, steps, self.reached, self.log.runs)
+
+
+def _times_s(records: Sequence[Mapping[str, Any]]) -> list[float]:
+    """Times of frames by one clock: the camera's, unless it is missing, or was set anew between two runs."""
+    told = [r["time_s"] for r in records]
+    if all(t is not None for t in told) and all(b > a for a, b in zip(told, told[1:], strict=False)):
+        return told
+    return [r["arrived_s"] for r in records]
 
 
 def full_exposure_of(level: Callable[[float], tuple[float, float]], camera: LiveCamera) -> float:

@@ -403,8 +403,9 @@ def _platform() -> str:
 def _cache_root() -> Path:
     """Return the first folder that this user can write to: PIXMETRY_CACHE_DIR, the user's cache, a private temporary folder."""
     asked = os.environ.get("PIXMETRY_CACHE_DIR")
-    user = Path(os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()) / "pixmetry"
-    for folder in ([Path(asked)] if asked else []) + [user]:
+    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    user = [] if home.startswith("~") else [Path(home) / "pixmetry"]  # a user without a home: a service, a container
+    for folder in ([Path(asked)] if asked else []) + user:
         try:
             (folder / "kernels").mkdir(mode=0o700, parents=True, exist_ok=True)
             if _is_ours(folder / "kernels") and os.access(folder / "kernels", os.W_OK | os.X_OK):

@@ -27,6 +27,7 @@ _NAMED_TIME = re.compile(rf"(?<![a-z])(?:t|te|exp|texp|exposure|exptime|shutter|
 _BARE_TIME = re.compile(rf"(?<![a-z])(?:exp|texp|exposure|exptime|shutter|tint)[ _=-]*{_NUMBER}(?![a-z0-9])")
 _TOLD_TIME = re.compile(rf"exposure(?:[ _]?time)?(?:[ _]?\(?{_UNIT}\)?)?['\"]?\s*[=:]\s*['\"]?{_NUMBER}\s*{_UNIT}?(?![a-z])")
 _WORDS = re.compile(r"[a-z]+")
+_DIGITS = re.compile(r"\d+")
 
 
 @dataclass(frozen=True)
@@ -75,6 +76,19 @@ def told_by_name(name: str) -> Told:
             return Told(exposure_s=_plain(float(number.replace(",", ".")) * SCALES[unit]), words=words)
     bare = _BARE_TIME.findall(text)
     return Told(unitless=float(bare[-1].replace(",", ".")) if bare else None, words=words)
+
+
+def counter_of(stem: str) -> int | None:
+    """The last number of a name that is no exposure time; None without one.
+
+    Examples
+    --------
+    >>> counter_of("img_0007_2.5ms"), counter_of("exp2.5ms_008"), counter_of("dark")
+    (7, 8, None)
+    """
+    text = _TIME.sub("_", _NAMED_TIME.sub("_", stem.lower()))
+    numbers = _DIGITS.findall(_BARE_TIME.sub("_", text)) or _DIGITS.findall(text)  # exposure_0007 may be a seventh exposure
+    return int(numbers[-1]) if numbers else None
 
 
 def told_by_file(path: Path) -> Told:
