@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 from dataclasses import replace
 from pathlib import Path
 
@@ -114,6 +115,24 @@ def test_what_a_program_reads_is_where_it_looks(tmp_path: Path) -> None:
     assert float(metashape.partition("<b1>")[2].partition("<")[0]) == pytest.approx(1.4)
     mrcal = eval((tmp_path / "c.cameramodel").read_text())
     assert mrcal["lensmodel"] == "LENSMODEL_OPENCV5" and mrcal["intrinsics"][6:8] == [LENS["p2"], LENS["p1"]]
+
+
+def test_long_files_of_cameras_are_read(tmp_path: Path) -> None:
+    """mrcal stores the observations in the file of a camera; a calibration of pixmetry holds all of its covariances."""
+    from pixmetry.core.door import MOST_SETTINGS_BYTES
+
+    model = CameraModel.of(Sensor(640, 480), "object_to_image", name="eye", **LENS)
+    write_exports([model], {"mrcal": tmp_path / "c.cameramodel"})
+    head = (tmp_path / "c.cameramodel").read_text().rstrip().rstrip("},\n ")
+    packed = base64.b85encode(bytes(range(256)) * (MOST_SETTINGS_BYTES // 256)).decode()
+    (tmp_path / "long.cameramodel").write_text(f"{head}, 'optimization_inputs': b'{packed}'}}")
+    (short,), (long,) = (read_cameras(tmp_path / f"{name}.cameramodel").values() for name in ("c", "long"))
+    assert str(long) == str(short)
+    (tmp_path / "long.cameramodel").write_text(f"{head}, 'other': {'[0],' * (MOST_SETTINGS_BYTES // 4)}}}")
+    with pytest.raises(InputError, match="too long for a camera"):
+        read_cameras(tmp_path / "long.cameramodel")
+    (tmp_path / "calibration.json").write_text('{"schema": "' + "x" * MOST_SETTINGS_BYTES + '"}')
+    assert read_cameras(tmp_path / "calibration.json") is None  # read as one of pixmetry's next
 
 
 def test_the_chain_of_kalibr_says_how_the_cameras_stand(rng: np.random.Generator, tmp_path: Path) -> None:

@@ -40,7 +40,7 @@ from pixmetry.files.images import read_picture
 from pixmetry.files.raw_values import RawLayout
 from pixmetry.files.told import told_by_file
 
-SOON_S = 5.0
+SOON_S = 30.0  # to read, unpack or wait would take for ever
 READERS: dict[str, Callable[[Path], object]] = {
     "x.json": read_positions,
     "subject.json": load_subject,
@@ -80,7 +80,10 @@ def sparse(path: Path, size: int, head: bytes = b"") -> Path:
     """A file with a hole: as large as one likes, and hardly anything on the disk."""
     with path.open("wb") as file:
         file.write(head)
-        file.truncate(size)
+        try:
+            file.truncate(size)
+        except OSError:
+            pytest.skip("no files with holes here")
     return path
 
 
@@ -267,6 +270,21 @@ def test_a_store_that_tells_of_frames_without_end_is_refused(tmp_path: Path) -> 
         (store / "frames" / "zarr.json").write_text(json.dumps(record))
         with soon("frames.zarr"):
             read_frame(store / "0")
+
+
+def test_a_store_in_large_shards_is_read_by_the_frame(tmp_path: Path, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A shard is no chunk: it need not fit into the memory; the last one is not full."""
+    zarr = pytest.importorskip("zarr")
+    frames = rng.integers(0, 4096, (7, 1000, 1000)).astype(np.uint16)
+    store = tmp_path / "frames.zarr"
+    group = zarr.create_group(store, zarr_format=3)
+    group.create_array("frames", data=frames, chunks=(1, 1000, 1000), shards=(4, 1000, 1000))
+    monkeypatch.setattr("pixmetry.core.memory.available_bytes", lambda: 2 * 2 * frames[0].size + 1)
+    np.testing.assert_array_equal(read_frame(store / "6"), frames[6])
+    (store / "frames" / "c" / "1" / "0" / "0").unlink()
+    (store / "frames" / "zarr.json").touch()
+    with pytest.raises(InputError, match="frames are missing"):
+        read_frame(store / "0")
 
 
 def test_a_camera_larger_than_any_sensor_is_refused_by_every_command(tmp_path: Path) -> None:

@@ -73,12 +73,14 @@ def _frames(store: Path, modified_ns: int) -> Any:
 
     with one_sentence("not a store of frames", str(store), remedy="copy or make the store again"):
         frames = zarr.open_array(LocalStore(store, read_only=True), path=ARRAY, mode="r", zarr_format=3)
-        complete = frames.nchunks_initialized == frames.nchunks
+        stored = frames.shards or frames.chunks  # files of the store; the last along an axis may reach beyond the frames
+        files = math.prod(-(-length // step) for length, step in zip(frames.shape, stored, strict=True))
+        complete = frames.nchunks_initialized == files * math.prod(stored) // math.prod(frames.chunks)
     if frames.ndim != 3:
         raise InputError("the array of frames has wrong axes", where=str(store), value=frames.shape, allowed="frame, row, column")
     check_frames(frames.shape[0], str(store))
     check_pixels(frames.shape[2], frames.shape[1], str(store))
-    needed = 2 * math.prod(frames.shards or frames.chunks) * frames.dtype.itemsize
+    needed = 2 * math.prod(frames.chunks) * frames.dtype.itemsize  # of a shard only the chunks of a frame are read
     check_memory(
         needed, f"a chunk of {frames.chunks} values", where=str(store), remedy="check the store, or make it again with chunks of one frame"
     )

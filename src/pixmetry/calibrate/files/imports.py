@@ -6,6 +6,7 @@ OpenCV and COLMAP are in `pixmetry.calibrate.exchange`.
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -24,6 +25,7 @@ from pixmetry.core.errors import InputError
 MRCAL = ("PINHOLE", "OPENCV4", "OPENCV5", "OPENCV8", "OPENCV12", "STEREOGRAPHIC")
 ROS = {"plumb_bob": False, "rational_polynomial": False, "equidistant": True}
 KEYS = ("distortion_model:", "distortion_coeffs:")  # of a YAML file of ROS, and of Kalibr
+_OBSERVATIONS = re.compile(r"('optimization_inputs':\s*)b'[^'\\]*'")  # in base 85, which has neither quotes nor backslashes
 METASHAPE = {"frame": "perspective", "fisheye": "equidistant", "equidistant_fisheye": "equidistant", "equisolid_fisheye": "equisolid"}
 
 
@@ -49,10 +51,13 @@ def read_cameras(path: str | Path, size: tuple[int, int] | None = None) -> dict[
     [905.0, 905.0]
     """
     source = Path(path)
-    ending, text = source.suffix.lower(), read_text(source, MOST_SETTINGS_BYTES)
+    ending = source.suffix.lower()
+    if ending == ".json":  # none of these programs; a calibration of pixmetry may be long
+        return None
+    text = read_text(source) if ending == ".cameramodel" else read_text(source, MOST_SETTINGS_BYTES)
     with one_sentence("a camera file that cannot be read", str(source), remedy="write it again"):
         if ending == ".cameramodel":
-            return {source.stem: _of_mrcal(ast.literal_eval(_without_remarks(text)), str(source))}
+            return {source.stem: _of_mrcal(ast.literal_eval(_of_settings(text, str(source))), str(source))}
         if ending == ".xml" and "<calibration>" in text and "opencv_storage" not in text:
             return {source.stem: _of_metashape(text, str(source))}
         if ending in (".dat", ".cal") and "ParGroup" in text:
@@ -66,8 +71,12 @@ def read_cameras(path: str | Path, size: tuple[int, int] | None = None) -> dict[
     return None
 
 
-def _without_remarks(text: str) -> str:
-    return "\n".join(line for line in text.splitlines() if not line.lstrip().startswith("#"))
+def _of_settings(text: str, where: str) -> str:
+    """A file of mrcal without remarks, and without the observations that it was made from, which may be most of it."""
+    bare = _OBSERVATIONS.sub(r"\1b''", "\n".join(line for line in text.splitlines() if not line.lstrip().startswith("#")))
+    if len(bare) > MOST_SETTINGS_BYTES:
+        raise InputError("too long for a camera", where=where, allowed=f"up to {MOST_SETTINGS_BYTES >> 20} MiB beside its observations")
+    return bare
 
 
 def _of_mrcal(record: Mapping[str, Any], where: str) -> CameraModel:
