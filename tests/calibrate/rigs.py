@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -96,3 +97,21 @@ def relative_error(found, simulated: SimulatedRig) -> np.ndarray:
         turn = Rotation.from_matrix(found.rotation[k] @ simulated.rotation[true].T).as_rotvec()
         out.append(np.concatenate([turn, found.place[k] - simulated.place[true]]))
     return np.concatenate(out)
+
+
+def written(folder: Path, sim: SimulatedRig, rig: str) -> Path:
+    """The project of a rig with its tables; instants by a column or by a line of the project."""
+    net = sim.network
+    rows = zip(net.image, net.point, net.x_px, net.y_px, strict=True)
+    lines = [f"{net.images[i]},{net.points[j]},{x:.4f},{y:.4f}" for i, j, x, y in rows]
+    (folder / "obs.csv").write_text("image,point,x_px,y_px\n" + "\n".join(lines))
+    points = [f"{name},{a},{b},{c}" for name, (a, b, c) in zip(net.points, net.xyz, strict=True)]
+    (folder / "points.csv").write_text("point,X,Y,Z\n" + "\n".join(points))
+    column = "instant" in rig
+    rows = [f"{name},cam{k}" + (f",{t}" if column else "") for name, k, t in zip(net.images, net.camera_of, net.instant, strict=True)]
+    (folder / "images.csv").write_text("image,camera" + (",instant" if column else "") + "\n" + "\n".join(rows))
+    cameras = "".join(f"- {{name: cam{k}, cols: 2048, rows: 1536, pitch_um: 3.45, free: 'c, xp, yp, k1, k2'}}\n" for k in range(2))
+    text = f"schema: pixmetry/calibration/1\ncameras:\n{cameras}observations: {{table: obs.csv, u_px: 0.05}}\nimages: images.csv\n"
+    text += "points: {table: points.csv, known: fixed}\noptions: {folds: 0}\n" + ("" if column else rig)
+    (folder / "project.yaml").write_text(text)
+    return folder / "project.yaml"

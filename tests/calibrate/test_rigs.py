@@ -13,7 +13,7 @@ from scipy.stats import chi2
 
 from calibrate.distances import Pooled
 from calibrate.networks import image_of
-from calibrate.rigs import relative_error, simulated_rig
+from calibrate.rigs import relative_error, simulated_rig, written
 from calibrate.test_calibration_images import View, chessboard
 from pixmetry import calibrate, read_calibration
 from pixmetry.calibrate.bundle.bundle import adjust
@@ -222,28 +222,11 @@ def test_names_tell_cameras_and_instants():
         cameras_of_files([Path("a.png"), Path("b.png")])
 
 
-def _written(folder: Path, sim, rig: str) -> Path:
-    net = sim.network
-    rows = zip(net.image, net.point, net.x_px, net.y_px, strict=True)
-    lines = [f"{net.images[i]},{net.points[j]},{x:.4f},{y:.4f}" for i, j, x, y in rows]
-    (folder / "obs.csv").write_text("image,point,x_px,y_px\n" + "\n".join(lines))
-    points = [f"{name},{a},{b},{c}" for name, (a, b, c) in zip(net.points, net.xyz, strict=True)]
-    (folder / "points.csv").write_text("point,X,Y,Z\n" + "\n".join(points))
-    column = "instant" in rig
-    rows = [f"{name},cam{k}" + (f",{t}" if column else "") for name, k, t in zip(net.images, net.camera_of, net.instant, strict=True)]
-    (folder / "images.csv").write_text("image,camera" + (",instant" if column else "") + "\n" + "\n".join(rows))
-    cameras = "".join(f"- {{name: cam{k}, cols: 2048, rows: 1536, pitch_um: 3.45, free: 'c, xp, yp, k1, k2'}}\n" for k in range(2))
-    text = f"schema: pixmetry/calibration/1\ncameras:\n{cameras}observations: {{table: obs.csv, u_px: 0.05}}\nimages: images.csv\n"
-    text += "points: {table: points.csv, known: fixed}\noptions: {folds: 0}\n" + ("" if column else rig)
-    (folder / "project.yaml").write_text(text)
-    return folder / "project.yaml"
-
-
 @pytest.mark.parametrize("rig", ["instant column", "rig: [[cam0-00, cam1-00], [cam0-03, cam1-03]]\n"])
 def test_a_project_names_the_instants(rig, rng, tmp_path):
     """By a column or by a list; the result, its file and its page hold the relative pose, within 6 u of the truth."""
     sim = simulated_rig(rng, instants=6)
-    found = calibrate(_written(tmp_path, sim, rig), tmp_path / "result")
+    found = calibrate(written(tmp_path, sim, rig), tmp_path / "result")
     stored = read_calibration(tmp_path / "result").tests.rig
     assert stored.instants == (2 if "[" in rig else 6)
     error = stored.cameras[0].position - sim.place[1]
@@ -281,13 +264,13 @@ def test_cameras_that_no_instant_joins_are_all_named(rng):
 
 def test_a_project_takes_instants_from_names(rng, tmp_path):
     sim = simulated_rig(rng, instants=4)
-    network = load_project(_written(tmp_path, sim, "rig: names\n")).network
+    network = load_project(written(tmp_path, sim, "rig: names\n")).network
     np.testing.assert_array_equal(network.instant, sim.network.instant)
 
 
 def test_instants_that_cannot_be_are_refused(rng, tmp_path):
     sim = simulated_rig(rng, instants=4)
-    project = _written(tmp_path, sim, "rig: [[cam0-00, cam0-01]]\n")
+    project = written(tmp_path, sim, "rig: [[cam0-00, cam0-01]]\n")
     with pytest.raises(InputError, match="one camera and one instant"):
         calibrate(project)
     project.write_text(project.read_text().replace("cam0-01]", "cam7-01]"))
