@@ -19,7 +19,7 @@ from pixmetry.locate.drawn_targets import Drawn
 from pixmetry.locate.files import locate_files
 from pixmetry.locate.job import locate
 from pixmetry.locate.noise import NoiseModel
-from pixmetry.locate.noise_correlation import correlation_of
+from pixmetry.locate.noise_correlation import LAGS_PX, Correlation, correlation_of, spread_of
 
 RATE = 1e-6
 SIDE = 14
@@ -141,6 +141,23 @@ def test_a_coder_that_leaves_nothing_of_a_target_does_not_make_it_certain() -> N
     )
     spread, _ = coder_spread(drawn, NoiseModel(1.0), Coder(0, 0, steps(20).astype(float)), 0.1)
     assert (spread.factor[:2] == 1).all()
+
+
+def test_offsets_of_rows_beside_a_shape_that_all_share_are_as_large_as_on_the_ground() -> None:
+    """Rows share 0.3 of a noise that is 0.6 of what the noise model says, which holds the misfit: the sum over all pairs of pixels is the
+    oracle. The covariance over more than 3 px was once that of the noise model, and u along the rows half of what it should be."""
+    v, u = np.indices((15, 15)) - 7.0
+    shape = np.exp(-(u**2 + v**2) / 6)
+    away, turn, everywhere = np.hypot(u, v), np.arctan2(v, u), np.ones((15, 15), bool)
+    one = Drawn(40 + 90 * shape, np.stack([u * shape, v * shape, shape]), everywhere, np.zeros((15, 15)), away, turn, 90.0)
+    shared = np.zeros((2 * LAGS_PX + 1,) * 2)
+    shared[LAGS_PX] = 0.3
+    shared[LAGS_PX, LAGS_PX] = 1.0
+    noise, known = NoiseModel(5.0), Correlation(3.0 * shared, np.full(shared.shape, 1e5))
+    sigma, gain, _ = one.gains(noise)
+    spread = spread_of(one, noise, known, None, np.sqrt(0.6) * sigma)
+    whole = 0.6 * (0.7 * (gain**2).sum(axis=(1, 2)) + 0.3 * (gain.sum(axis=2) ** 2).sum(axis=1))
+    assert spread.factor == pytest.approx(whole / (gain**2).sum(axis=(1, 2)), rel=1e-6)
 
 
 def test_a_channel_of_a_coloured_jpeg_has_not_the_steps_of_its_luminance(tmp_path: Path, rng: np.random.Generator) -> None:

@@ -194,16 +194,16 @@ class Shared:
     variance_dn2: float
 
 
-def _shared(one: Drawn, noise: NoiseModel, known: Correlation, near_alike: np.ndarray | None = None) -> Shared:
-    """What the pixels of a target share, the variances themselves left out."""
+def _shared(one: Drawn, noise: NoiseModel, known: Correlation, near_alike: np.ndarray | None = None, ratio: float = 1.0) -> Shared:
+    """What the pixels of a target share, the variances themselves left out; ``ratio`` of its noise to that of the noise model, squared."""
     side = len(one.mean)
     covariance, pairs = known.over(side)
     lag = np.abs(np.arange(1 - side, side))
     near = np.maximum(lag[:, None], lag) <= NEAR_PX
     # the noise model's variance on the ground, and not that of the blocks: what rows share must cancel in x to the last percent
-    variance = float(noise.variance_dn2(np.median(one.mean[[0, -1]])))
-    ratio = covariance / known.variance_dn2
-    here, around = np.where(near, ratio, 0.0), np.where(near, 0.0, ratio * variance)
+    variance = ratio * float(noise.variance_dn2(np.median(one.mean[[0, -1]])))
+    alike = covariance / known.variance_dn2
+    here, around = np.where(near, alike, 0.0), np.where(near, 0.0, alike * variance)
     if near_alike is not None:
         middle = slice(side - 1 - NEAR_PX, side + NEAR_PX)
         here[middle, middle] = near_alike
@@ -234,9 +234,11 @@ def spread_of(
     """
     sigma, gain, basis = one.gains(noise)
     expected = (gain**2).sum(axis=(1, 2))
+    ratio = 1.0
     if sigma_dn is not None:
+        ratio = float(np.median((sigma_dn / sigma)[one.mask])) ** 2
         gain, sigma = gain * (sigma_dn / sigma), sigma_dn
-    shared = _shared(one, noise, known, near_alike)
+    shared = _shared(one, noise, known, near_alike, ratio)
     ground = gain / sigma  # answers to DN, for what rows and columns share
     own, in_dn, of_basis = np.split(lag_sums(np.concatenate([gain, ground, basis])), 3)
     factor = ((gain**2).sum(axis=(1, 2)) + (own * shared.here + in_dn * shared.around).sum(axis=(1, 2))) / expected
