@@ -14,6 +14,7 @@ REACH = 4  # px; farthest lag to each side
 LAGS = tuple((j, i) for j in range(REACH + 1) for i in range(-REACH, REACH + 1) if j > 0 or i >= 0)  # rows and columns; (0, 0) first
 WHITE, LINEAR, CHARGE, MOSAIC, UNKNOWN = "white", "linear", "charge", "mosaic", "unknown"
 MEDIAN = "median"
+LINE = "filter along the row"
 
 
 @dataclass(frozen=True)
@@ -96,6 +97,8 @@ class NoiseFilter:
         Variance of the means of rows and of columns behind the filter, over that of independent pixels with the variance behind it.
     dark_factor : float or None
         The same of the noise in the dark, where it is not ``factor``.
+    clock_factor : float
+        What of ``factor`` comes from sampling at another rate than that of the pixels: it changes no noise that a row has in common.
     growth : float
         What the factor gains, beside that, from dark to the brightest level.
     correlation : ndarray, shape (41,)
@@ -122,6 +125,7 @@ class NoiseFilter:
     row_factor: float = 1.0
     column_factor: float = 1.0
     dark_factor: float | None = None
+    clock_factor: float = 1.0
     growth: float = 0.0
     correlation: np.ndarray = field(default_factory=lambda: np.eye(1, len(LAGS))[0])
     covariance: np.ndarray = field(default_factory=lambda: np.zeros((len(LAGS) - 1, len(LAGS) - 1)))
@@ -131,6 +135,11 @@ class NoiseFilter:
     rival: NoiseFilter | None = None
     inside: tuple[np.ndarray, np.ndarray] | None = None
 
+    @property
+    def along_row(self) -> bool:
+        """Whether it is a filter along the row, as of an analogue line."""
+        return self.kind == LINEAR and self.name.startswith(LINE)
+
     def variance_before(self, shot_dn2: np.ndarray, shift: float = 0.0) -> np.ndarray:
         """Shot variance before the filter from that behind it, DN², any shape; with ``shift`` added to the factor."""
         if self.kind == CHARGE:
@@ -138,7 +147,7 @@ class NoiseFilter:
             before = charge_response(loss, reach, np.ravel(shot_dn2))[0].reshape(np.shape(shot_dn2))
             moved: Array = before + shift * shot_dn2**2 * self.shot_dn2.sum() / (self.shot_dn2**2).sum()
             return moved
-        scaled: Array = shot_dn2 * (self.factor + shift + (self.growth * shot_dn2 / self.shot_dn2.max() if self.growth else 0.0))
+        scaled: Array = shot_dn2 * (self.factor + shift + (self.clock_factor * self.growth * shot_dn2 / self.shot_dn2.max() if self.growth else 0.0))
         return scaled
 
 

@@ -40,6 +40,11 @@ class StatedFacts:
     sensor_rows: int | None = None
 
     @property
+    def samples_per_pixel(self) -> float:
+        """Sampling clock over pixel clock; 1 where they are not both stated, or are the same."""
+        return self.sampling_clock_mhz / self.pixel_clock_mhz if self.own_clock else 1.0  # type: ignore[operator]
+
+    @property
     def own_clock(self) -> bool:
         """Whether the frame grabber samples at another rate than the pixel clock."""
         if self.sampling_clock_mhz is None or self.pixel_clock_mhz is None:

@@ -16,6 +16,7 @@ import numpy as np
 from pixmetry.camera.noise_covariance import (
     CHARGE,
     LAGS,
+    LINE,
     LINEAR,
     MEDIAN,
     MOSAIC,
@@ -37,7 +38,9 @@ from pixmetry.core.errors import MeasureError
 from pixmetry.core.number import Estimates, effective_dof
 from pixmetry.observe.mosaic import find_mosaic, shot_of_places
 from pixmetry.observe.photon_transfer_fit import fit_photon_transfer
-from pixmetry.observe.photon_transfer_model import MINIMUM_DARK_VAR_DN2, QUANTISATION_DN2
+from pixmetry.observe.photon_transfer_levels import core_spread_dn2
+from pixmetry.observe.photon_transfer_model import MINIMUM_DARK_VAR_DN2, QUANTISATION_DN2, rounding_error_vars, slope_error_var
+from pixmetry.observe.sampled_line import sampled
 
 MOST_CLIPPED = 0.002  # share of the pixels at the ends of the codes
 LITTLE_MORE, FALLEN = 1.15, 0.75  # of light and variance from level to level: so much less where pixels are full
@@ -47,11 +50,10 @@ REPELLED = 0.08  # the same of repelled charge that can be seen: most sensors ha
 LARGEST_SHARE, LARGEST_LOSS, LARGEST_ALPHA = 0.2, 0.03, 0.9  # if there: all sizes up to this are equally likely
 FIT_LEVEL = 1e-4  # chance of a worse fit below which a family is refused
 NEAR = tuple(k for k, (j, i) in enumerate(LAGS) if 0 < max(abs(j), abs(i)) <= 2)
-SHARPENING, BLUR, KERNEL, LINE, LOSS = (
+SHARPENING, BLUR, KERNEL, LOSS = (
     "unsharp mask",
     "Gaussian blur",
     "kernel of 3 × 3",
-    "filter along the row",
     "charge that repels charge",
 )
 BLUR_RADII = (1, 2, 3)
@@ -73,6 +75,7 @@ ALONG_LINE_REL = 0.04  # of a fixed contrast: jitter of the rows in the mean of 
 RESOLVED = 10.0  # u of the shot variance of a level that counts
 OF_PIXELS, OF_COLUMNS = ("prnu_pixel_rel", "dsnu_pixel_dn"), ("prnu_col_rel", "dsnu_col_dn")
 OF_ROWS = ("prnu_row_rel", "dsnu_row_dn")
+ASSUMED_DNL_LSB = 0.1  # standard deviation of the code widths of a grabber where they are not measured: a common limit of ±½ LSB is 5 of it
 LEAST_DOUBT = 0.1  # of the gain's u: a smaller part adds less than 0.5 % to it
 
 
@@ -264,12 +267,14 @@ def _match(family: _Family, part: _ShotPart, constant_alone: bool = False) -> _M
     )
 
 
-def find_noise_filter(seen: NoiseCovariance | None) -> NoiseFilter | None:
+def find_noise_filter(seen: NoiseCovariance | None, samples_per_pixel: float = 1.0) -> NoiseFilter | None:
     """What filtered the noise of a campaign; None where it holds no shot noise to tell it by.
 
     Parameters
     ----------
     seen : NoiseCovariance or None
+    samples_per_pixel : float
+        Of a frame grabber: its sampling clock over the pixel clock.
 
     Returns
     -------
@@ -284,6 +289,12 @@ def find_noise_filter(seen: NoiseCovariance | None) -> NoiseFilter | None:
     part = None if seen is None else _shot_part(seen)
     if seen is None or part is None:
         return None
+    found = _at_pixel_rate(seen, part)
+    return found if samples_per_pixel == 1 else sampled(found, samples_per_pixel)
+
+
+def _at_pixel_rate(seen: NoiseCovariance, part: _ShotPart) -> NoiseFilter:
+    """What filtered the noise, of one sample to a pixel."""
     plain = NoiseFilter(
         kind=WHITE,
         name="neighbours are not correlated",
@@ -525,9 +536,9 @@ def before_correlation(spatial: Estimates, found: NoiseFilter, shot_dn2: float) 
     evened = ["prnu_pixel_rel"]
     if found.kind == LINEAR:
         scale, u = float(np.sqrt(found.factor)), 0.5 * found.u_factor / found.factor
-        if found.name == LINE:
+        if found.along_row:
             u = float(np.hypot(u, ALONG_LINE_REL))
-        evened += ["dsnu_pixel_dn", *(OF_COLUMNS if found.name == LINE else ())]
+        evened += ["dsnu_pixel_dn", *(OF_COLUMNS if found.along_row else ())]
     own = np.array([name in evened for name in spatial.names])
     factor = np.where(own, scale, 1.0)
     more = np.where(own, spatial.values * factor * u, 0.0)
@@ -551,7 +562,7 @@ def before_filter(
     """
     levels = series.dark.ms_pixel_dn2 if series.dark.ms_pixel_dn2.size else np.array([np.nan if dark is None else dark.ms_pixel_dn2])
     black = float(np.average(levels, weights=series.dark.n_frames - 1.0 if series.dark.ms_pixel_dn2.size else None))
-    after = QUANTISATION_DN2 if found.name == LINE else 0.0
+    after = QUANTISATION_DN2 if found.along_row else 0.0
     again = QUANTISATION_DN2 * (0.5 if found.kind == MOSAIC else 1.0)  # one half of the pixels is original
 
     def unfiltered_lines(ms_dn2: Any, var_dn2: Any, before_dn2: Any, of_line: float, pixels: int) -> Any:
@@ -559,7 +570,7 @@ def before_filter(
         if found.kind in (CHARGE, WHITE):
             return ms_dn2
         in_common = ms_dn2 - var_dn2 * of_line / pixels
-        return before_dn2 / pixels + in_common * (found.factor + shift) / of_line
+        return before_dn2 / pixels + in_common * (found.factor + shift) / found.clock_factor / of_line
 
     def unfiltered_level(level: L, white_dn2: Any) -> L:
         rows, cols = series.frame_shape
@@ -658,6 +669,10 @@ def fit_unfiltered(
         what = "a correlation of successive frames that is too weak to be told from none (temporal noise reduction)"
         reasons.append(f"u contains {3 * alpha_rms:.2g} of all variances for {what}")
     here = _with_hidden_noise(here, series, found)
+    if found.along_row:
+        stretched, why = _by_code_widths(here, series, dark, dnl_lsb)
+        changes += stretched
+        here = replace(here, reasons={**here.reasons, **{n: "; ".join(filter(None, (here.reasons.get(n, ""), t))) for n, t in why.items()}})
     if not changes:
         return here
     # variances of correlated pixels scatter like those of fewer pixels (Bartlett)
@@ -667,6 +682,26 @@ def fit_unfiltered(
     covariance = fewer * here.covariance + sum(np.outer(c, c) for c in changes)
     reason = "; ".join(filter(None, (*reasons, here.reasons.get("gain_dn_per_e", ""))))
     return replace(here, covariance=covariance, dof=dof, reasons={**here.reasons, "gain_dn_per_e": reason})
+
+
+def _by_code_widths(
+    here: Estimates, series: PhotonTransfer, dark: StackMoments | None, dnl_lsb: float
+) -> tuple[list[Array], dict[str, str]]:
+    """What unequal codes do to the noise in the dark, which a line made small before it came to the converter; and its reason."""
+    levels = series.dark
+    if not levels.ms_pixel_dn2.size:
+        return [], {}
+    var = max(float(levels.ms_pixel_dn2.mean()) - QUANTISATION_DN2, QUANTISATION_DN2)
+    dither = float(levels.ms_row_dn2.mean() + levels.ms_col_dn2.mean()) + core_spread_dn2(dark)
+    dnl = dnl_lsb or ASSUMED_DNL_LSB
+    of_lines = float(np.sqrt(slope_error_var(var, dither, dnl)))
+    of_pixels = 0.5 * float(np.sqrt(rounding_error_vars(np.array(var), dither, dnl)[1])) / var
+    shares = {"dark_noise_e": of_pixels, "row_noise_e": of_lines, "column_noise_e": of_lines}
+    shares = {n: share for n, share in shares.items() if n in here and n not in here.limits}
+    changes = [np.where(np.array(here.names) == n, share * here.values, 0.0) for n, share in shares.items()]
+    what = "as measured" if dnl_lsb else "assumed, for they are not measured"
+    why = {n: f"u contains {share:.2g} of it for codes of unequal width ({dnl:.2g} LSB, {what})" for n, share in shares.items()}
+    return changes, why
 
 
 def _change(here: Estimates, there: Estimates) -> Array:

@@ -152,7 +152,7 @@ def observe(
     codes = _codes(sweep_histogram(sweep, bits), notes) if table is None else None  # gaps of a table are no fault of the converter
     with single_threaded_blas():
         noise = noise_covariance(correlated)
-        noise_filter = find_noise_filter(noise)
+        noise_filter = find_noise_filter(noise, told.samples_per_pixel)
         fit = _transfer_fit(transfer, (dark_stack, bright_stack), _dnl_lsb(codes), noise, noise_filter, table, notes)
     if noise_filter is not None and noise_filter.kind == MOSAIC:
         meant = "the gain is that of the original pixels, and the fixed pattern, of interpolated ones too, is smaller than the sensor's"
