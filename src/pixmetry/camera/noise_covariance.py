@@ -147,7 +147,8 @@ class NoiseFilter:
             before = charge_response(loss, reach, np.ravel(shot_dn2))[0].reshape(np.shape(shot_dn2))
             moved: Array = before + shift * shot_dn2**2 * self.shot_dn2.sum() / (self.shot_dn2**2).sum()
             return moved
-        scaled: Array = shot_dn2 * (self.factor + shift + (self.clock_factor * self.growth * shot_dn2 / self.shot_dn2.max() if self.growth else 0.0))
+        growth = self.clock_factor * self.growth * shot_dn2 / self.shot_dn2.max() if self.growth else 0.0
+        scaled: Array = shot_dn2 * (self.factor + shift + growth)
         return scaled
 
 
