@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 import tomllib
@@ -34,6 +35,17 @@ def test_every_optional_package_is_in_its_extra_and_in_no_other_place() -> None:
         assert package in [name.partition(">")[0] for name in extras[extra]]
         assert not any(name.startswith(package) for name in project["dependencies"])
         assert (extra in extras["all"][0]) == (extra not in NOT_IN_ALL)
+
+
+def test_pages_install_extras_that_there_are_from_a_checkout() -> None:
+    """pixmetry is on no package index: `pip install pixmetry` would bring somebody else's."""
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    told = set()
+    for page in [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]:
+        for what, names in re.findall(r"pip install ['\"]?([\w.]+)\[([\w,]+)\]", page.read_text(encoding="utf-8")):
+            assert what == ".", page
+            told |= set(names.split(","))
+    assert told <= set(extras) and {extra for _, extra, _ in EXTRAS.values()} - set(extras["all"][0][:-1].partition("[")[2].split(",")) <= told
 
 
 @pytest.mark.parametrize("module", EXTRAS)
