@@ -170,6 +170,11 @@ def test_files_that_no_capture_wrote_stay_as_they_are(rng: np.random.Generator, 
             capture(camera, edge(2), folder, Obedient(camera), full_s=FULL_S)
         assert [path for path in folder.rglob("*") if path.is_file()] == [own] and own.read_bytes() == b"mine"
     capture(camera, edge(2), tmp_path / "shots", Obedient(camera), full_s=FULL_S)
+    (tmp_path / "one").mkdir()
+    (tmp_path / "one" / "capture.jsonl").write_bytes(b"a line without an end")
+    with pytest.raises(InputError, match="not a log of a capture"):
+        capture(camera, edge(2), tmp_path / "one", Obedient(camera), full_s=FULL_S)
+    assert (tmp_path / "one" / "capture.jsonl").read_bytes() == b"a line without an end"
     added = [tmp_path / "shots" / "frames" / name for name in ("notes.txt", "edge_01_0001_cut.tif", "other_01_0001.tif")]
     for path in added:
         path.write_bytes(b"mine")

@@ -83,6 +83,8 @@ class CaptureLog:
         self._file.seek(0)
         lines = self._file.read().splitlines(keepends=True)
         if lines and not lines[-1].endswith(b"\n"):
+            if len(lines) == 1 and not lines[0].startswith(b'{"schema": "pixmetry/'[: len(lines[0])]):
+                raise InputError("not a log of a capture", where=str(self.path), remedy=REMEDY)
             lines = lines[:-1]
         for number, line in enumerate(lines, start=1):
             try:
