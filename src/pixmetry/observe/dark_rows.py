@@ -128,10 +128,12 @@ def without_hum(patterns: PatternList | None, rows: DarkRows | None, spectra: Sp
     if patterns is None or rows is None or spectra is None:
         return patterns
     if not rows.flicker.limits:  # found, or not told as behind a filter
-        column = np.minimum(np.rint(patterns.frequency_x * rows.cols).astype(int), len(spectra.frequency_h) - 1)
+        place, last = patterns.frequency_x * rows.cols, len(spectra.frequency_h) - 1
+        beside = [np.clip(to(place).astype(int), np.rint(place) >= 1, last) for to in (np.floor, np.ceil)]  # in column 0 rows differ, too
+        noise = np.maximum(*(spectra.temporal_h_dn2[column] for column in beside))
         power = patterns.amplitude_dn**2 * rows.rows * rows.cols / 4
         least = np.where(patterns.moving, LEAST_WAVE, LEAST_FIXED_WAVE / rows.frames)
-        patterns = _kept(patterns, power > least * spectra.temporal_h_dn2[column])
+        patterns = _kept(patterns, power > least * noise)
     if "per_row" not in rows.hum:
         return patterns
     near_y = np.abs(np.abs(patterns.frequency_y) - rows.hum["per_row"].value) < 2 / rows.rows
@@ -344,8 +346,8 @@ def _flicker_of(
     data_v, weight_v = power[ordinates], np.full(len(ordinates), float(frames - 1))
     data, weight = np.concatenate([data_h, data_v]), np.concatenate([weight_h, weight_v])
     if not data.any():
-        why = "the frames are all the same: rounding hides the noise; raise the black level, or the gain"
-        return replace(Estimates.empty(), reasons={"rms_dn": why}), np.full_like(power, np.nan), {}
+        same = "the frames are all the same: rounding hides the noise; raise the black level, or the gain"
+        return replace(Estimates.empty(), reasons={"rms_dn": same}), np.full_like(power, np.nan), {}
     shapes = {c: _shapes(float(c), along, ordinates, size, line_px) for c in (*CORNERS, TYPICAL_CORNER)}
 
     def design(shape: np.ndarray) -> np.ndarray:
