@@ -2,7 +2,8 @@
 
 Each cell of the grid (one pitch wide, about a dot's place) is taken from the picture as its neighbours place it, and compared with the
 median of all cells. Cells that look otherwise are marks. Two pictures of one plate are laid upon each other so that their marks agree.
-Part of a plate is numbered by three marks that are not in a line.
+Part of a plate is numbered by three marks that are not in a line and that two other pictures show alike: dirt and clutter make marks too,
+and between two pictures they may agree in the wrong place.
 """
 
 from __future__ import annotations
@@ -21,10 +22,12 @@ LEAST_RMS, LEAST_RATIO = 0.1, 3.0  # of a look against the median of all: in uni
 LEAST_CONTRAST = 0.4  # of a cell, over the median of all, by which its look is divided at least
 MOST_MARKS = 24  # of a picture, those that differ most
 ALIKE = 0.6  # correlation from which two marks are the same
+SAME_LOOK = 0.8  # the same for parts of a plate, where the strength counts too: clutter upon a dot resembles a hollow one
 AGAINST = 0.5  # what a mark costs that the other picture has not where it shows the cell
 FAINT = 0.3  # of a mark, below which the other picture has it not
 CLEAR = 0.45  # by which the best way must be better than the second one
 LEAST_MARKS = 3  # that a plate must have for parts of it to be numbered
+LEAST_PARTS = 3  # pictures that must agree, of parts of a plate
 MOST_REFERENCES = 12
 ROUND = 1.3  # ratio of the axes of dots in units of the grid's steps, from which another pair of steps is looked for
 
@@ -158,7 +161,7 @@ class Laid:
     shift: tuple[int, int] = (0, 0)
 
 
-def laid_on(whole: Looks, part: Looks, turns: Sequence[int], *, shifted: bool) -> Laid | None:
+def laid_on(whole: Looks, part: Looks, turns: Sequence[int], *, shifted: bool, confirmed: bool = False) -> Laid | None:
     """How the grid of one picture is laid on another's so that their marks agree; None where they do not decide.
 
     Parameters
@@ -168,6 +171,8 @@ def laid_on(whole: Looks, part: Looks, turns: Sequence[int], *, shifted: bool) -
         Quarters by which it may be turned.
     shifted : bool
         Whether its first row and column may be any of the plate's; else they are the plate's.
+    confirmed : bool
+        Of parts: whether several pictures showed the marks of the whole, so that a plain dot in the place of one rules a way out.
     """
     ways = []
     for k in turns:
@@ -176,24 +181,38 @@ def laid_on(whole: Looks, part: Looks, turns: Sequence[int], *, shifted: bool) -
         if shifted:
             away = np.stack([whole.row[:, None] - other.row, whole.col[:, None] - other.col], axis=2).reshape(-1, 2)
             shifts = {(int(a), int(b)) for a, b in away}
-        ways += [(*_agreement(whole, other, shift), Laid(k, shift)) for shift in shifts]
-    ways.sort(key=lambda way: -way[0])
+        ways += [(_agreement(whole, other, shift), Laid(k, shift)) for shift in shifts]
     if not ways:
         return None
-    score, same, way = ways[0]
-    clear = score - (ways[1][0] if len(ways) > 1 else -np.inf) >= CLEAR
-    if not shifted:
-        return way if clear and len(same) and score >= ALIKE else None
-    in_plane = len(same) >= LEAST_MARKS and np.linalg.matrix_rank(same - same[0]) == 2
-    sure = clear and score > 0 and in_plane  # with two, clutter on the other picture may speak against the right way
-    return way if sure else None
+    if shifted:  # clutter on one of the pictures is no mark of both, and does not speak against a way
+        most = sorted((len(one.same) for one, _ in ways), reverse=True)[:2]
+        best, way = max(ways, key=lambda one: len(one[0].same))
+        return way if _in_plane(best.same) and (len(most) < 2 or most[0] > most[1]) and not (confirmed and best.denied) else None
+    ways.sort(key=lambda way: -way[0].score)
+    best, way = ways[0]
+    clear = best.score - (ways[1][0].score if len(ways) > 1 else -np.inf) >= CLEAR
+    return way if clear and best.alike and best.score >= ALIKE else None
 
 
-def _agreement(whole: Looks, part: Looks, shift: tuple[int, int]) -> tuple[float, np.ndarray]:
-    """Correlations of marks at the same place, less what contradicts; and the places of those that are alike, shape (m, 2)."""
+def _in_plane(cells: np.ndarray) -> bool:
+    return len(cells) >= LEAST_MARKS and bool(np.linalg.matrix_rank(cells - cells[0]) == 2)
+
+
+@dataclass(frozen=True)
+class _Agreement:
+    """Correlations of marks at the same place, less what contradicts; of how many they are alike; the places of those that are the same,
+    shape (m, 2); and whether the part shows a plain dot where the whole has a mark."""
+
+    score: float
+    alike: int
+    same: np.ndarray
+    denied: bool
+
+
+def _agreement(whole: Looks, part: Looks, shift: tuple[int, int]) -> _Agreement:
     there = set(zip(whole.row.tolist(), whole.col.tolist(), strict=True))
     here = set(zip((part.row + shift[0]).tolist(), (part.col + shift[1]).tolist(), strict=True))
-    score, same, against = 0.0, [], 0
+    score, alike, same, against, denied = 0.0, 0, [], 0, False
     for r, c in there | here:
         at = r - shift[0], c - shift[1]
         if not (_shows(whole.seen, r, c) and _shows(part.seen, *at)):
@@ -201,13 +220,16 @@ def _agreement(whole: Looks, part: Looks, shift: tuple[int, int]) -> tuple[float
         a, b = whole.away[r, c], part.away[at]
         product, of_whole, of_part = float((a * b).sum()), float((a * a).sum()), float((b * b).sum())
         if (r, c) in there and (r, c) in here:
-            alike = product / np.sqrt(of_whole * of_part)
-            score += alike
-            if alike >= ALIKE:
+            correlation = product / np.sqrt(of_whole * of_part)
+            score += correlation
+            alike += correlation >= ALIKE
+            if 2 * product >= SAME_LOOK * (of_whole + of_part):
                 same.append((r, c))
         else:  # a mark that is too faint to be told does not contradict
-            against += product < FAINT * (of_whole if (r, c) in there else of_part)
-    return score - AGAINST * against, np.array(same).reshape(-1, 2)
+            of_mark = of_whole if (r, c) in there else of_part
+            against += product < FAINT * of_mark
+            denied |= (r, c) in there and product < FAINT * of_mark and of_part < FAINT * of_mark
+    return _Agreement(score - AGAINST * against, alike, np.array(same).reshape(-1, 2), denied)
 
 
 def _shows(seen: np.ndarray, row: int, col: int) -> bool:
@@ -225,33 +247,57 @@ def by_marks(looks: Sequence[Looks], turns: Sequence[int], *, shifted: bool, pla
     shifted : bool
         Whether they show parts of the plate.
     plate : Looks, optional
-        On which they are laid; by default that picture on which most of the others can be laid, with the marks that these add.
+        On which they are laid; by default that picture on which most of the others can be laid. Parts must then be confirmed by others.
     """
     if plate is not None:
-        return [laid_on(plate, one, turns, shifted=shifted) for one in looks]
+        return [laid_on(plate, one, turns, shifted=shifted, confirmed=True) for one in looks]
     least = LEAST_MARKS if shifted else 1
     marked = [k for k, one in enumerate(looks) if len(one.row) >= least]
     nothing: list[Laid | None] = [None] * len(looks)
+    drawn = np.unique(np.linspace(0, len(marked) - 1, min(MOST_REFERENCES, len(marked))).astype(int))
+    references = [marked[k] for k in drawn]
+    found = [
+        [Laid(0) if k == one else laid_on(looks[one], part, turns, shifted=shifted) for k, part in enumerate(looks)] for one in references
+    ]
+    found.sort(key=_laid_count, reverse=True)
+    if not shifted:
+        return found[0] if found and _laid_count(found[0]) > 1 else nothing
     best = nothing
-    for reference in (
-        [marked[k] for k in np.unique(np.linspace(0, len(marked) - 1, min(MOST_REFERENCES, len(marked))).astype(int))] if marked else []
-    ):
-        found = [Laid(0) if k == reference else laid_on(looks[reference], one, turns, shifted=shifted) for k, one in enumerate(looks)]
-        if sum(one is not None for one in found) > sum(one is not None for one in best):
-            best = found
-    if sum(one is not None for one in best) < 2:
-        return nothing
-    if shifted:  # what the others add to the plate tells where the rest belongs
-        whole, (row, col) = together(looks, best)
-        for k, one in enumerate(looks):
-            if best[k] is None:
-                way = laid_on(whole, one, turns, shifted=True)
-                best[k] = None if way is None else replace(way, shift=(way.shift[0] + row, way.shift[1] + col))
+    for one in found:
+        sure = _confirmed(looks, one, turns)
+        best = max(best, sure, key=_laid_count)
+        if _laid_count(best) >= _laid_count(one):  # and the next ones have no more
+            break
     return best
 
 
+def _laid_count(laid: Sequence[Laid | None]) -> int:
+    return sum(way is not None for way in laid)
+
+
+def _confirmed(looks: Sequence[Looks], found: Sequence[Laid | None], turns: Sequence[int]) -> list[Laid | None]:
+    """Those pictures that the marks of the others place alike, each of these shown by two of them; and the rest where such marks tell."""
+    laid = list(found)
+    while _laid_count(laid) >= LEAST_PARTS:
+        off = [k for k, way in enumerate(laid) if way is not None and _on_others(looks, laid, k, turns) != way]
+        if not off:
+            break
+        laid[off[-1]] = None
+    else:
+        return [None] * len(laid)
+    return [_on_others(looks, laid, k, turns) if way is None else way for k, way in enumerate(laid)]
+
+
+def _on_others(looks: Sequence[Looks], laid: Sequence[Laid | None], k: int, turns: Sequence[int]) -> Laid | None:
+    """How a picture is laid on the plate as the others show it."""
+    whole, (row, col) = together(looks, [None if k == i else way for i, way in enumerate(laid)])
+    way = laid_on(whole, looks[k], turns, shifted=True, confirmed=True)
+    return None if way is None else replace(way, shift=(way.shift[0] + row, way.shift[1] + col))
+
+
 def together(looks: Sequence[Looks], laid: Sequence[Laid | None]) -> tuple[Looks, tuple[int, int]]:
-    """The plate as all pictures show it that are laid on it: marks that half of them have, and the row and column of its first cell."""
+    """The plate as all pictures show it that are laid on it: marks that half of them have, two at least, and the row and column of its
+    first cell."""
     parts = [(one.turned(way.quarters), way.shift) for one, way in zip(looks, laid, strict=True) if way is not None]
     least = np.min([shift for _, shift in parts], axis=0)
     extent = np.max([np.array(one.seen.shape) + shift for one, shift in parts], axis=0) - least
@@ -263,5 +309,5 @@ def together(looks: Sequence[Looks], laid: Sequence[Laid | None]) -> tuple[Looks
         seen[row : row + rows, col : col + cols] += one.seen
         away[row : row + rows, col : col + cols] += one.away
         found[one.row + row, one.col + col] += 1
-    r, c = np.nonzero((found > 0) & (2 * found >= seen))
+    r, c = np.nonzero((found > 1) & (2 * found >= seen))
     return Looks(seen > 0, r, c, away / np.maximum(seen, 1)[..., None, None]), (int(least[0]), int(least[1]))

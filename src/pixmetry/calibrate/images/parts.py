@@ -7,13 +7,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from pixmetry.calibrate.images.looks import LEAST_MARKS, Laid, Looks, by_marks, together
+from pixmetry.calibrate.images.looks import LEAST_MARKS, LEAST_PARTS, Laid, Looks, by_marks, together
 from pixmetry.calibrate.images.numbering import column_angle_deg, turned_cells
 from pixmetry.calibrate.images.targets import Seen, Wanted
 from pixmetry.core.errors import InputError
 from pixmetry.core.finding import Finding
 
-NO_MARKS = f"parts of a plate are numbered only where {LEAST_MARKS} marks among its dots (hollow, larger or coded ones) tell which part"
+NO_MARKS = (
+    f"parts of a plate are numbered only where {LEAST_MARKS} marks among its dots (hollow, larger or coded ones), alike in {LEAST_PARTS} "
+    "images or more, tell which part"
+)
 UNSURE = "its marks do not tell which part of the plate it shows"
 TEXT = "{} images show parts of the plate. They were numbered alike by the marks among its dots; row 0, column 0 is the first seen."
 
