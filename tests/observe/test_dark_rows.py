@@ -207,3 +207,18 @@ def test_page_and_results_have_them(rng: np.random.Generator, tmp_path: Path):
     assert "A hum of" in (tmp_path / "result" / "report.html").read_text()
     assert found.to_record()["dark_rows"]["hum"]["names"][0] == "amplitude_dn"
     assert found.camera["electronics.supply_pickup"].params.frequency_hz == pytest.approx(4000.0, rel=0.02)
+
+
+def test_row_noise_behind_a_filter_along_the_row_is_without_what_changes_slowly(rng: np.random.Generator) -> None:
+    """1/f noise of 3 DN beside row noise of 2 DN: it would make 3 DN of it."""
+
+    def filtered(count: int, electrons: float) -> np.ndarray:
+        frames = frames_of(rng, count, electrons, flicker_dn=3.0, row_dn=2.0).astype(float)
+        return np.rint(ndimage.convolve1d(frames, [0.15, 0.7, 0.15], axis=2, mode="nearest")).astype(np.uint16)
+
+    groups = [Frames("dark", 0.01, filtered(16, 0.0), role="stack")]
+    groups += [Frames("bright" if e else "dark", 1e-3 * k, filtered(2, e * k)) for k in range(1, 9) for e in (0.0, 800.0)]
+    seen = observe_campaign(campaign_of_arrays(groups, bits=12, line_time_us=LINE_US, pixel_clock_mhz=8.0), no_progress)[1]
+    found = measure_sources(seen)[0]["electronics.row_noise"]["row_e"]
+    assert "changes slowly" in found.reason
+    assert abs(found.value - 2.0 / GAIN) < 5 * found.u and found.u < 0.35 * 2.0 / GAIN

@@ -28,6 +28,8 @@ LEAST_WAVE = 12.0  # power of a wave over that of the noise of its column of the
 LEAST_FIXED_WAVE = 40.0  # the same in the mean of the frames, of which there is one only
 TWO_FIELDS = 1.25  # by which two fields must explain more than one frame
 MOST_HZ = 5e6
+SLOW_Z = 4.0  # of an excess at low frequencies of the means of the rows: white noise has it in 3e-5 of cameras
+OF_SLOW, U_OF_SLOW = 1.75, 0.25  # all of 1/f noise in the means of the rows over that excess: evenly from 1.3 to 2.2
 HUM_METHOD = "line in the periodogram of the means of the rows, from frame to frame"
 FLICKER_METHOD = "periodograms along the rows and of their means, fitted by white noise, row noise and 1/f noise (Whittle)"
 
@@ -76,6 +78,8 @@ def reduce_dark_rows(
     if noise_filter is not None and noise_filter.kind not in (WHITE, CHARGE):
         why = f"the frames are filtered ({noise_filter.name}), and their spectrum with them"
         flicker, fitted = replace(Estimates.empty(), reasons={"rms_dn": why}), np.full_like(power, np.nan)
+        if noise_filter.along_row and line is None:  # which leaves the means of the rows as they are
+            taken["row"] = _slow_rows(power, len(whole) - 1)
     else:
         size = (len(whole), *shape)
         flicker, fitted, parts = _flicker_of(spectra, power, lines, size, line_px, turn)
@@ -86,6 +90,20 @@ def reduce_dark_rows(
         within = _within_rows(hum, shape[1])
         taken["pixel"] = taken["pixel"][0] + within[0], float(np.hypot(taken["pixel"][1], within[1]))
     return DarkRows(len(whole), *shape, frequency, power, fitted, hum, flicker, line_px, u_line_px, taken)
+
+
+def _slow_rows(power: np.ndarray, pairs: int) -> tuple[float, float]:
+    """What 1/f noise gives to the means of the rows, from what their spectrum has more at low than at high frequencies; and its u.
+
+    The noise of the rows themselves is white from row to row. A spectrum 1/f from one cycle a frame on has 1.4 times as much in all as its
+    mean exceeds that of its upper half; one that is level below 0.09 cycles a row, 2.1 times.
+    """
+    slow, upper = power[1:], power[len(power) // 2 :]
+    more = float(slow.mean() - upper.mean())
+    u = float(slow.mean()) * np.sqrt(1 / (pairs * len(upper)) - 1 / (pairs * len(slow)))
+    if more < SLOW_Z * u:
+        return 0.0, 0.0
+    return OF_SLOW * more, float(np.hypot(OF_SLOW * u, U_OF_SLOW * more))
 
 
 def _line_px(stated: StatedFacts, cols: int) -> tuple[float, float]:

@@ -55,7 +55,9 @@ def measure(observations: Observations) -> Estimates:
     scatter = hum[0] * np.sqrt(len(series.n_frames) / 2) / max(float((series.n_frames - 1).sum()), 1.0)
     gain2 = fit["gain_dn_per_e"].value ** 2
     square, u = (hum[0] + flicker[0]) / gain2, float(np.linalg.norm([hum[1], flicker[1], scatter])) / gain2
-    return without_variance(noise, "row_e", square, u, "hum or 1/f noise, which is measured by itself,")
+    told = "rms_dn" in rows.flicker
+    what = "hum or 1/f noise, which is measured by itself," if told or hum[0] else "what changes slowly from row to row, as 1/f noise does,"
+    return without_variance(noise, "row_e", square, u, what)
 
 
 def correct(params: RowNoise, signal: Signal, maps: Mapping[str, np.ndarray]) -> Signal:
