@@ -521,8 +521,8 @@ def before_correlation(spatial: Estimates, found: NoiseFilter, shot_dn2: float) 
     if found.kind == UNKNOWN and not found.name.startswith(("demosaicking", MEDIAN)):
         why = f"what correlates neighbouring pixels ({found.name}) changes the pattern too, and by how much is not told"
         across = np.array([j > 0 for j, _ in LAGS[1:]])  # a filter along the rows leaves the means of rows as they are
-        u = np.sqrt(np.diag(found.covariance))
-        rows = () if (np.abs(found.correlation[1:]) <= FOUND_Z * u)[across].all() and u.any() else OF_ROWS
+        u_each = np.sqrt(np.diag(found.covariance))
+        rows = () if (np.abs(found.correlation[1:]) <= FOUND_Z * u_each)[across].all() and u_each.any() else OF_ROWS
         lost = [n for n in (*OF_PIXELS, *OF_COLUMNS, *rows) if n in spatial]
         kept = spatial.select([n for n in spatial.names if n not in lost])
         return replace(kept, reasons={**kept.reasons, **dict.fromkeys(lost, why)})
