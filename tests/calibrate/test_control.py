@@ -94,7 +94,7 @@ def test_a_wrong_coordinate_is_found_beside_many_good_images(rng, point, axis):
 def test_control_stays_as_stated_where_that_is_wanted(rng, u):
     """A coordinate that is wrong by 3 mm, of seven points that are good to 0.05 mm or taken as exact: by default it is left out; as stated
     all stay, with their uncertainties, no image point goes for it, and a warning says that they contradict each other."""
-    simulated = wrong_by(with_control(rng, whole=7), 5, 2, 3.0)
+    simulated = wrong_by(with_control(rng, whole=7, images=10, points=60), 5, 2, 3.0)
     network = replace(simulated.network, u_xyz=np.where(simulated.network.u_xyz == U_MM, u, simulated.network.u_xyz))
     simulated = replace(simulated, network=network)
     kept, tested = calibrated(simulated, replace(QUICK, control="as_stated")), calibrated(simulated)
