@@ -128,7 +128,7 @@ def test_the_page_holds_no_inline_code_and_names_no_other_address() -> None:
 def test_values_that_cannot_be_used_are_refused_and_the_server_goes_on(server: Any, wrong: Any) -> None:
     reply = post(server, "/picture", wrong)
     if wrong == {"camera": "imx264_like", "estimator": "no such"}:
-        assert post(server, "/found", wrong).json()["found"]["reason"].startswith("no such estimator")
+        assert post(server, "/found", wrong).json()["found"]["reason"].startswith("estimator: no such estimator")
     else:
         assert reply.status_code == 200 and set(reply.json()) == {"error"} and len(reply.json()["error"]) < 4000
     assert set(post(server, "/camera", STATE).json()) > {"chain", "scenario"}

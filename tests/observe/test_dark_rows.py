@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -168,7 +169,8 @@ def test_one_over_f_noise_behind_a_filter_along_the_row_makes_no_waves(rng: np.r
 def test_a_wave_between_two_columns_of_the_spectrum_is_held_against_both():
     """At 1.51 columns, where 1/f noise falls by half from the first to the second: 14 of the second are 7 of the first."""
     power = np.array([9.0, 2.0, 1.0, 0.7])
-    rows = DarkRows(8, 64, 6, *[np.zeros(1)] * 3, Estimates.empty(), Estimates.empty(), 6.0, 0.0, {})
+    untold = replace(Estimates.empty(), reasons={"rms_dn": "the frames are filtered (along the row)"})
+    rows = DarkRows(8, 64, 6, *[np.zeros(1)] * 3, Estimates.empty(), untold, 6.0, 0.0, {})
     spectra = SimpleNamespace(frequency_h=np.arange(4) / 6, temporal_h_dn2=power)
     for times, place, kept in ((14.0, 1.51, 0), (26.0, 1.51, 1), (26.0, 0.7, 1)):
         amplitude = np.array([np.sqrt(4 * times / 64 / 6)])

@@ -58,7 +58,7 @@ TARGET_BEFORE_LENS = (
 )
 
 
-@typed
+@partial(typed, but=("campaign",))  # of arrays it says more
 def assess(
     campaign: str | Path | Campaign | None = None,
     output: str | Path | None = None,

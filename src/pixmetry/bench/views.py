@@ -130,8 +130,8 @@ def over_a_pixel(shelf: Shelf, state: BenchState, kept: KeptSteps, go_on: Callab
         one = shelf.laid_out(state.model_copy(update={"x_px": float(round(x0) + dx), "y_px": y0, "side_px": 64}))
         picture = picture_of(one, kept, quiet=True, go_on=go_on)
         for name in names:
-            found = found_in(picture, replace(one, state=one.state.model_copy(update={"estimator": name})), one.true_px)
-            errors[name].append(None if found.error_px is None else found.error_px[0])
+            target = found_in(picture, replace(one, state=one.state.model_copy(update={"estimator": name})), one.true_px)
+            errors[name].append(None if target.error_px is None else target.error_px[0])
     found = {name: [v for v in values if v is not None] for name, values in errors.items()}
     ranges = {name: float(np.ptp(values)) if values else None for name, values in found.items()}
     return {"place_px": places.tolist(), "errors_px": errors, "range_px": ranges}

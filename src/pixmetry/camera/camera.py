@@ -21,7 +21,7 @@ from pixmetry.camera.source import run
 from pixmetry.camera.unit_maps import MeasuredUnit, check_frame, check_maps, listing, maps_file, read_unit_maps, write_unit_maps
 from pixmetry.core.arguments import typed
 from pixmetry.core.checksums import check_file
-from pixmetry.core.door import check_pixels
+from pixmetry.core.door import MOST_OF_CAMERA, check_pixels
 from pixmetry.core.errors import ChainError, InputError
 from pixmetry.core.memory import check_memory
 from pixmetry.core.number import Estimates
@@ -97,7 +97,7 @@ class Camera:
         check_chain(self.chain, self.name)
         if min(self.frame_shape) < 1:
             raise ChainError("a frame has no pixels", where=self.name, value=self.frame_shape)
-        check_pixels(self.frame_shape[1], self.frame_shape[0], self.name)
+        check_pixels(self.frame_shape[1], self.frame_shape[0], self.name, MOST_OF_CAMERA)
         for element in self.chain:
             check_maps(element, f"{self.name}, {element.name}")
             check_provenance(element, f"{self.name}, {element.name}")

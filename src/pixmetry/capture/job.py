@@ -140,7 +140,7 @@ class _Run:
         self._remove_unnoted()
         self.levels: dict[int, GroupLevels] = {}
         first = next((record["frame"] for records in self.log.frames.values() for record in records), None)
-        self.shape: tuple[int, int] | None = None if first is None else _pixels(self.frames / first).shape  # type: ignore[assignment]
+        self.shape: tuple[int, int] | None = None if first is None else _pixels(self.frames / first).shape
         self.place = ""
         self.written_s = -math.inf
         self.reached: tuple[Reached, ...] = ()

@@ -91,8 +91,10 @@ def choice(value: Any, among: Iterable[str], where: str, what: str) -> str:
     return str(value)
 
 
-def typed(function: Callable[P, R]) -> Callable[P, R]:
+def typed(function: Callable[P, R], but: Collection[str] = ()) -> Callable[P, R]:
     """A public function whose arguments are refused by their names where they are not what its annotations say.
+
+    ``but`` names arguments that the function refuses in words of its own.
 
     Texts, paths, numbers, truth values, records, collections of them, functions and classes are checked; ``Any`` is not. A number is no
     NaN, and a truth value is no number. What a value must be besides, the function checks itself.
@@ -109,9 +111,10 @@ def typed(function: Callable[P, R]) -> Callable[P, R]:
     pixmetry.core.errors.InputError: factor: an argument of another type; found '3'; allowed: a whole number
     """
     parameters = inspect.signature(function).parameters
-    kinds = {name: ast.parse(str(one.annotation), mode="eval").body for name, one in parameters.items() if one.annotation is not one.empty}
+    told = {name: one for name, one in parameters.items() if one.annotation is not one.empty and name not in but}
+    kinds = {name: ast.parse(str(one.annotation), mode="eval").body for name, one in told.items()}
     plain = {name for name, one in parameters.items() if one.kind in (one.VAR_POSITIONAL, one.VAR_KEYWORD)}
-    order, known = list(parameters), function.__globals__  # type: ignore[attr-defined]
+    order, known = list(parameters), function.__globals__
 
     @wraps(function)
     def checked(*args: P.args, **options: P.kwargs) -> R:
@@ -179,6 +182,9 @@ def _is_one(value: Any, kind: ast.expr, known: Mapping[str, Any]) -> bool:
         return isinstance(value, meant)
     if name in ("Callable", "Progress") or get_origin(meant) is Callable:
         return callable(value)
+    stands_for = get_origin(meant)  # of a name for tuple[int, int, int, int], say
+    if isinstance(stands_for, type):
+        return isinstance(value, (tuple, list) if stands_for is tuple else stands_for)
     if name == "ndarray":
         return isinstance(value, np.ndarray)
     return type(value).__module__.partition(".")[0] not in ("builtins", "numpy")  # a class that is imported where it is needed

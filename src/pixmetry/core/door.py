@@ -21,6 +21,7 @@ from pixmetry.core.memory import check_memory
 MOST_SETTINGS_BYTES = 1 << 23  # of YAML: a manifest that names 200 000 frames one by one
 MOST_TEXT_BYTES = 1 << 30  # of tables, JSON and XML: some 10 million rows
 MOST_PIXELS = 1 << 30  # of one frame: 32768 x 32768
+MOST_OF_CAMERA = 1 << 36  # of a simulated sensor, which may be seen through windows
 MOST_FRAMES = 1_000_000  # in one file or store
 MOST_DEPTH = 64  # of lists and records in each other
 MOST_NODES = 4_000_000  # values in a file of settings, each alias counted as what it stands for
@@ -135,16 +136,16 @@ def check_depth(value: Any, where: str, most: int = MOST_DEPTH) -> None:
         raise InputError("nested too deep", where=where, allowed=f"up to {most} levels", remedy="check the file")
 
 
-def check_pixels(cols: int, rows: int, where: str = "") -> None:
+def check_pixels(cols: int, rows: int, where: str = "", most: int = MOST_PIXELS) -> None:
     """Refuse the size of an image that no sensor has.
 
     Raises
     ------
     InputError
     """
-    if cols * rows > MOST_PIXELS:
+    if cols * rows > most:
         what = f"an image of {cols} x {rows} pixels"
-        raise InputError(what, where=where, allowed=f"up to {MOST_PIXELS} pixels", remedy="check the file, or cut the image into parts")
+        raise InputError(what, where=where, allowed=f"up to {most} pixels", remedy="check the file, or cut the image into parts")
 
 
 def check_frames(count: int, where: str = "") -> None:

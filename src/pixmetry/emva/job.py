@@ -42,7 +42,7 @@ class Options:
             raise InputError("not a number of draws", where="bootstrap", value=self.bootstrap, allowed="0, or 100 to 1000000")
 
 
-@typed
+@partial(typed, but=("campaign",))  # of arrays it says more
 def emva1288(
     campaign: str | Path | Campaign | None = None,
     *,

@@ -28,6 +28,7 @@ LEAST_WAVE = 12.0  # power of a wave over that of the noise of its column of the
 LEAST_FIXED_WAVE = 40.0  # the same in the mean of the frames, of which there is one only
 TWO_FIELDS = 1.25  # by which two fields must explain more than one frame
 MOST_HZ = 5e6
+FILTERED = "the frames are filtered"  # why 1/f noise is not told
 SLOW_Z = 4.0  # of an excess at low frequencies of the means of the rows: white noise has it in 3e-5 of cameras
 OF_SLOW, U_OF_SLOW = 1.75, 0.25  # all of 1/f noise in the means of the rows over that excess: evenly from 1.3 to 2.2
 HUM_METHOD = "line in the periodogram of the means of the rows, from frame to frame"
@@ -76,7 +77,7 @@ def reduce_dark_rows(
     turn = (line[0], _turns_along(hum)) if line is not None and "per_col" in hum else (0.0, 0.0)
     lines = () if line is None else _ordinates_of(line[2], shape[0], scan)
     if noise_filter is not None and noise_filter.kind not in (WHITE, CHARGE):
-        why = f"the frames are filtered ({noise_filter.name}), and their spectrum with them"
+        why = f"{FILTERED} ({noise_filter.name}), and their spectrum with them"
         flicker, fitted = replace(Estimates.empty(), reasons={"rms_dn": why}), np.full_like(power, np.nan)
         if noise_filter.along_row and line is None:  # which leaves the means of the rows as they are
             taken["row"] = _slow_rows(power, len(whole) - 1)
@@ -145,7 +146,8 @@ def without_hum(patterns: PatternList | None, rows: DarkRows | None, spectra: Sp
     """The waves without what a hum leaves of itself in the first columns of their spectrum, and without 1/f noise that rises there."""
     if patterns is None or rows is None or spectra is None:
         return patterns
-    if not rows.flicker.limits:  # found, or not told as behind a filter
+    untold = any(reason.startswith(FILTERED) for reason in rows.flicker.reasons.values())
+    if untold or (len(rows.flicker) and not rows.flicker.limits):
         place, last = patterns.frequency_x * rows.cols, len(spectra.frequency_h) - 1
         beside = [np.clip(to(place).astype(int), np.rint(place) >= 1, last) for to in (np.floor, np.ceil)]  # in column 0 rows differ, too
         noise = np.maximum(*(spectra.temporal_h_dn2[column] for column in beside))

@@ -169,7 +169,7 @@ def cameras_of_australis(text: str, where: str) -> dict[str, CameraModel]:
     InputError
         If it has no camera, or something of one is missing.
     """
-    out = {}
+    out: dict[str, CameraModel] = {}
     for part in re.split(r"^\s*Results for Camera\s+", text, flags=re.MULTILINE)[1:]:
         head = re.match(r"(\d+)[ \t]*(.*?)[ \t]*(?:Lens[ \t]*)?$", part, re.MULTILINE)
         name = head[2] or f"camera {head[1]}" if head else "camera"
@@ -233,7 +233,7 @@ def cameras_of_photomodeler(text: str, where: str, size: tuple[int, int] | None 
     heads = list(re.finditer(r"^\s*Camera\d+:[ \t]*(.*?)[ \t]*$", part, re.MULTILINE))
     if not heads:
         raise InputError("no camera in the report", where=where, allowed="the report of a project that calibrated its camera")
-    out = {}
+    out: dict[str, CameraModel] = {}
     for head, after in zip(heads, [*heads[1:], None], strict=True):
         name, own = head[1], part[head.end() : after.start() if after else None]
         told = re.search(r"(\d{2,6})\s*[xX×]\s*(\d{2,6})", name)

@@ -16,7 +16,6 @@ from pixmetry.calibrate.bundle.model import NAMES, CameraModel, Sensor
 from pixmetry.calibrate.checks.known_residuals import control_of
 from pixmetry.calibrate.lines.plumb_line import LineCalibration
 from pixmetry.calibrate.records import Calibration, ResidualGrid, Tests, read_record, record_of
-from pixmetry.core.arguments import typed
 from pixmetry.core.checksums import check_record, sealed
 from pixmetry.core.config import read_text
 from pixmetry.core.door import check_depth, inflated, one_sentence
@@ -221,7 +220,6 @@ def unpacked(record: Mapping[str, Any]) -> np.ndarray:
     return matrix + np.tril(matrix, -1).T
 
 
-@typed
 def read_calibration(path: str | Path) -> StoredCalibration:
     """Read a calibration back.
 

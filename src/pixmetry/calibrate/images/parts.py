@@ -70,7 +70,7 @@ def numbered_parts(
             assert wanted.grid is not None
             problem = f"by the marks, the images show {cols} × {rows} dots together, not {wanted.grid[0]} × {wanted.grid[1]}"
         else:
-            keys = {k: np.column_stack(turned_cells(*one.T, rows, cols, quarters)) for k, one in keys.items()}
+            keys = {k: np.column_stack(turned_cells(one[:, 0], one[:, 1], rows, cols, quarters)) for k, one in keys.items()}
             plate = plate.turned(quarters)
     out = []
     for k, one in enumerate(seen):
@@ -96,7 +96,7 @@ def _standing(keys: dict[int, np.ndarray], shape: tuple[int, int], seen: Sequenc
     for quarters in range(4):
         extent = (rows, cols) if quarters % 2 == 0 else (cols, rows)
         if wanted.grid is None or (extent[0] <= wanted.grid[1] and extent[1] <= wanted.grid[0]):
-            at = np.column_stack(turned_cells(*keys[first].T, rows, cols, quarters))
+            at = np.column_stack(turned_cells(keys[first][:, 0], keys[first][:, 1], rows, cols, quarters))
             board = replace(seen[first], keys=at, extent=extent).board
             ways.append((abs((column_angle_deg(board) + 180) % 360 - 180), quarters))
     return min(ways)[1] if ways else None
