@@ -81,9 +81,11 @@ def test_later_frames_are_those_of_locate(estimator: str, dtype: type, rng: np.r
         frame = exposed(discs(x + 0.31 * k, y - 0.17 * k), rng).astype(dtype)
         frame.setflags(write=False)
         tracked, found = tracker.update(frame), locate(frame, estimator=estimator, noise=NOISE)
-        assert len(found) == len(tracked) == 12
-        which = np.argmin(np.hypot(tracked.x_px[:, None] - found.x_px, tracked.y_px[:, None] - found.y_px), axis=1)
-        off.append((tracked.x_px - found.x_px[which]) / np.sqrt(found.var_x_px2[which]))
+        # one more in a hundred frames is a false alarm
+        at_x, at_y = x[:, None] + 0.31 * k, y[:, None] - 0.17 * k
+        own, which = (np.argmin(np.hypot(at_x - seen.x_px, at_y - seen.y_px), axis=1) for seen in (tracked, found))
+        assert len(set(own)) == len(set(which)) == 12 and max(len(tracked), len(found)) <= 13
+        off.append((tracked.x_px[own] - found.x_px[which]) / np.sqrt(found.var_x_px2[which]))
     off = np.abs(np.concatenate(off))
     assert np.quantile(off, 0.8) < 1e-3
     assert off.max() < (0.01 if estimator == "template" else 0.8)
