@@ -197,7 +197,7 @@ def _is_collection(value: Any, kind: ast.expr, name: str, known: Mapping[str, An
     if not isinstance(kind, ast.Subscript) or not isinstance(value, Collection):
         return True
     inner = list(kind.slice.elts) if isinstance(kind.slice, ast.Tuple) else [kind.slice]
-    if name in ("Mapping", "dict"):
+    if isinstance(value, Mapping) and name in ("Mapping", "dict"):
         return all(_is(key, inner[0], known) for key in value) and all(_is(item, inner[1], known) for item in value.values())
     if name == "tuple" and not (len(inner) == 2 and _name(inner[1]) == "Ellipsis"):
         return len(value) == len(inner) and all(_is(item, one, known) for item, one in zip(value, inner, strict=True))
