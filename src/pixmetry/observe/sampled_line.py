@@ -66,8 +66,8 @@ def folded_share(at_half: float, samples_per_pixel: float) -> float:
 
     Examples
     --------
-    >>> round(folded_share(0.2, 0.7048), 4), round(folded_share(0.2, 1.0), 4)
-    (0.0127, 0.0)
+    >>> round(folded_share(0.2, 0.7048), 3), round(folded_share(0.2, 1.0), 4)
+    (0.013, 0.0)
     """
     from scipy.optimize import brentq
 
